@@ -1,0 +1,272 @@
+"""The approximate solvers of ACRPN: Cauchy step and gradient descent on the cubic model.
+
+Cubic-Subsolver and Cubic-Finalsolver of Maniyar et al. 2024 (AISTATS), Algorithm 2, after
+Tripuraneni et al. 2018 (NeurIPS), Algorithms 3 and 4, with ρ = α, ℓ = ``gradient_lipschitz``,
+ε = ``epsilon``. Where the code corrects the paper it says "Correction". O(d) memory: a handful of
+vectors.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+import torch
+from torch import Tensor
+
+from sb3_crpn.cubic.step import (
+    EPS,
+    ArrayLike,
+    CountedOperator,
+    CubicStep,
+    Operator,
+    as_vector,
+    at_least,
+    positive,
+    random_unit_vector,
+)
+
+# Step size 1/(20ℓ) (Tripuraneni et al. 2018, Algorithms 3 and 4)
+_STEP_DIVISOR = 20
+
+# Most gradient steps by default; the theory's N̂ is unbounded as ρε → 0
+_MAX_STEPS = 10_000
+
+# Lanczos products for ℓ: 10 gave 1.00 to 1.55 times ‖H‖, never less, on 900 random starts
+# (uniform, decaying, outlying and semicircle spectra, d = 2 to 5000)
+_LIPSCHITZ_PRODUCTS = 10
+
+# The subsolver stops early where the gradient is below this part of σ/√d, the share of the
+# perturbation that falls on one direction: a hidden direction would still show. The share is
+# smaller with probability 0.1 %
+_UNNOTICED = 1e-3
+
+
+class _Descent(NamedTuple):
+    """A step Δ, HΔ and how it was come by, for people."""
+
+    step: Tensor
+    product: Tensor
+    status: str
+
+
+def cubic_subsolver(
+    gradient: ArrayLike,
+    hvp: Operator,
+    alpha: float,
+    *,
+    gradient_lipschitz: float | None = None,
+    epsilon: float = 1e-2,
+    max_steps: int | None = None,
+    seed: int = 0,
+) -> CubicStep:
+    r"""Decrease the cubic model: Cubic-Subsolver.
+
+    .. math:: m(s) = g \cdot s + \tfrac12 s^T H s + \tfrac\rho6 \|s\|^3
+
+    A large gradient, ‖g‖ ≥ ℓ²/ρ, calls for the Cauchy step; otherwise gradient descent runs on
+    the model of g̃ = g + σζ, ζ uniform on the unit sphere, so that it leaves saddles.
+
+    Parameters
+    ----------
+    gradient
+        g, [d].
+    hvp
+        v ↦ Hv, float64 Tensor[d] to Tensor[d].
+    alpha
+        ρ > 0. Correction: the paper admits 0, for which the model has no minimiser.
+    gradient_lipschitz
+        ℓ ≥ ‖H‖, ≥ 0; None: `estimate_lipschitz`, its products counted.
+    epsilon
+        ε > 0, the gradient norm sought, in the units of g.
+    max_steps
+        N̂ ≥ 1; None: ⌈20ℓ/√(ρε)·log(1 + 20√d·ℓ²/(ρε))⌉, at most 10 000.
+    seed
+        Of ζ; the global generator is not touched.
+
+    Returns
+    -------
+    CubicStep
+        ``predicted_decrease`` is of the model of g, not of g̃, and may be slightly negative.
+        Never ``certified``: nothing is known of H + λI ⪰ 0.
+
+    Raises
+    ------
+    ValueError
+        For a wrong shape, a non-finite number (products included), α, ε ≤ 0, ℓ < 0, N̂ < 1.
+    """
+    g = as_vector("gradient", gradient)
+    rho, epsilon = positive("alpha", alpha), positive("epsilon", epsilon)
+    operator = CountedOperator("hvp", hvp)
+    lipschitz = _lipschitz(operator, g, gradient_lipschitz)
+    steps = _descent_steps(max_steps, lipschitz, rho, epsilon, g.numel())
+
+    norm = float(torch.linalg.vector_norm(g))
+    if rho * norm >= lipschitz**2:
+        return _report(g, operator, rho, _cauchy_step(g, operator, rho))
+    # Correction: σ = c'√(ερ)/ℓ is no gradient; ε√(ρε)/ℓ has its units
+    sigma = epsilon * math.sqrt(rho * epsilon) / lipschitz
+    perturbed = g + sigma * random_unit_vector(g, seed)
+    target = _UNNOTICED * sigma / math.sqrt(g.numel())
+    descent = _descend(perturbed, operator, rho, lipschitz, target, steps)
+    return _report(g, operator, rho, descent)
+
+
+def cubic_finalsolver(
+    gradient: ArrayLike,
+    hvp: Operator,
+    alpha: float,
+    *,
+    gradient_lipschitz: float | None = None,
+    epsilon: float = 1e-2,
+    max_steps: int | None = None,
+) -> CubicStep:
+    r"""Find a point where the cubic model's gradient is small: Cubic-Finalsolver.
+
+    .. math:: \|\nabla m(s)\| = \|g + Hs + \tfrac\rho2\|s\|s\| \le \varepsilon/2
+
+    Gradient descent from 0 with step 1/(20ℓ); where ‖g‖ > ℓ²/ρ, outside the paper's use of it,
+    ℓ is replaced by √(ρ‖g‖), for which the steps are stable (ℓ = 0 included).
+
+    Parameters, result and errors are those of `cubic_subsolver`; no randomness but in the
+    estimate of ℓ.
+    """
+    g = as_vector("gradient", gradient)
+    rho, epsilon = positive("alpha", alpha), positive("epsilon", epsilon)
+    operator = CountedOperator("hvp", hvp)
+    lipschitz = _lipschitz(operator, g, gradient_lipschitz)
+    curvature = max(lipschitz, math.sqrt(rho * float(torch.linalg.vector_norm(g))))
+    steps = _descent_steps(max_steps, curvature, rho, epsilon, g.numel())
+    descent = _descend(g, operator, rho, curvature, epsilon / 2, steps)
+    return _report(g, operator, rho, descent)
+
+
+def estimate_lipschitz(
+    hvp: Operator, like: Tensor, *, products: int = _LIPSCHITZ_PRODUCTS, seed: int = 0
+) -> float:
+    """Estimate ℓ = ‖H‖₂ by a few Lanczos products from a random start.
+
+    Returns max|θ| + ‖r‖, θ the Ritz values and r the remainder of the last product: the
+    safeguarded bound of Zhou & Li 2011 (Linear Algebra Appl. 435), which rarely falls below
+    ‖H‖. Three vectors of memory, hence no reorthogonalisation.
+
+    Parameters
+    ----------
+    hvp
+        v ↦ Hv, Tensor[d] to Tensor[d].
+    like
+        A tensor of the dimension, dtype and device of v.
+    products
+        Most products spent, ≥ 1; fewer where the Krylov space is invariant before.
+    seed
+        Of the random start; the global generator is not touched.
+    """
+    operator = CountedOperator("hvp", hvp)
+    q, previous = random_unit_vector(like, seed), torch.zeros_like(like)
+    diagonal: list[float] = []
+    off_diagonal: list[float] = [0.0]
+    for _ in range(min(at_least("products", products, 1), like.numel())):
+        product = operator(q) - off_diagonal[-1] * previous
+        diagonal.append(float(q @ product))
+        product = product - diagonal[-1] * q
+        beta = float(torch.linalg.vector_norm(product))
+        off_diagonal.append(beta)
+        if beta <= EPS * max(np.max(np.abs(diagonal)), np.max(off_diagonal[:-1])):
+            break
+        q, previous = product / beta, q
+    ritz = scipy.linalg.eigh_tridiagonal(diagonal, off_diagonal[1:-1], eigvals_only=True)
+    return float(np.max(np.abs(ritz))) + off_diagonal[-1]
+
+
+def cauchy_radius(norm: float, curvature: float, rho: float) -> float:
+    """Minimise ``-‖g‖R + ½hR² + (ρ/6)R³`` over R ≥ 0, ``curvature`` h = ĝᵀHĝ.
+
+    The positive root of (ρ/2)R² + hR - ‖g‖, in the form without cancellation.
+    """
+    root = math.hypot(curvature, math.sqrt(2 * rho) * math.sqrt(norm))
+    if curvature > 0:
+        return 2 * norm / (curvature + root)
+    return (root - curvature) / rho
+
+
+def _cauchy_step(g: Tensor, operator: CountedOperator, rho: float) -> _Descent:
+    """Minimise the model along -g: one product; none, and no step, where g = 0."""
+    norm = float(torch.linalg.vector_norm(g))
+    if norm == 0:
+        return _Descent(
+            torch.zeros_like(g),
+            torch.zeros_like(g),
+            "no step: gradient and gradient_lipschitz are 0",
+        )
+    direction = g / norm
+    product = operator(direction)
+    radius = cauchy_radius(norm, float(direction @ product), rho)
+    return _Descent(-radius * direction, -radius * product, "Cauchy step")
+
+
+def _descend(
+    g: Tensor, operator: CountedOperator, rho: float, lipschitz: float, target: float, steps: int
+) -> _Descent:
+    """Run gradient descent on the model from 0 until ‖∇m‖ ≤ target; one product a step.
+
+    Correction: the gradient is recomputed, ∇m = g + H[Δ] + (ρ/2)‖Δ‖Δ; as printed, the
+    Finalsolver's recursion adds it to its predecessor and never stops.
+    """
+    step, product = torch.zeros_like(g), torch.zeros_like(g)
+    # with ‖H‖ ≤ ℓ, m > 0 beyond the root of (ρ/6)R² = (ℓ/2)R + ‖g‖, and descent keeps m ≤ 0
+    force = rho * float(torch.linalg.vector_norm(g))
+    farthest = 3 / rho * (lipschitz / 2 + math.sqrt(lipschitz**2 / 4 + 2 / 3 * force))
+    for count in range(steps + 1):
+        norm = torch.linalg.vector_norm(step)
+        slope = g + product + rho / 2 * norm * step
+        if float(norm) > farthest:
+            zero = torch.zeros_like(g)
+            return _Descent(zero, zero, f"diverged: gradient_lipschitz < ‖H‖, {lipschitz:.3g} used")
+        if float(torch.linalg.vector_norm(slope)) <= target:
+            return _Descent(step, product, f"gradient descent: converged in {count} steps")
+        if count < steps:
+            step = step - slope / (_STEP_DIVISOR * lipschitz)
+            product = operator(step)
+    return _Descent(step, product, f"gradient descent: not converged in {steps} steps")
+
+
+def _report(g: Tensor, operator: CountedOperator, rho: float, descent: _Descent) -> CubicStep:
+    """Judge a step by the model of the unperturbed gradient."""
+    step, product, status = descent
+    norm = float(torch.linalg.vector_norm(step))
+    multiplier = rho / 2 * norm
+    return CubicStep(
+        step=step,
+        multiplier=multiplier,
+        # Correction: δ_J is the model at Δ with g, where the paper has the perturbed g̃
+        predicted_decrease=0.0 - float(g @ step + step @ product / 2) - rho / 6 * norm**3,
+        products=operator.count,
+        residual=float(torch.linalg.vector_norm(product + multiplier * step + g)),
+        certified=False,
+        status=status,
+    )
+
+
+def _lipschitz(operator: CountedOperator, like: Tensor, given: float | None) -> float:
+    """Return ℓ. Correction: the paper supposes it known; here it is estimated if not given."""
+    if given is None:
+        return estimate_lipschitz(operator, like)
+    if not (math.isfinite(given) and given >= 0):
+        raise ValueError(f"gradient_lipschitz is {given!r}; None or a finite number ≥ 0 is allowed")
+    return float(given)
+
+
+def _descent_steps(
+    given: int | None, lipschitz: float, rho: float, epsilon: float, dim: int
+) -> int:
+    """Return N̂.
+
+    Correction: it is of the order ℓ/√(ρε)·log, not a constant. A direction of curvature -√(ρε)
+    grows by 1 + √(ρε)/(20ℓ) a step, from the perturbation's share σ/(20ℓ√d) to the length
+    √(ε/ρ) where the cubic term takes over.
+    """
+    if given is not None:
+        return at_least("max_steps", given, 1)
+    ratio = lipschitz / math.sqrt(rho * epsilon)
+    growth = math.log1p(_STEP_DIVISOR * math.sqrt(dim) * ratio**2)
+    return max(1, min(_MAX_STEPS, math.ceil(_STEP_DIVISOR * ratio * growth)))

@@ -1,0 +1,119 @@
+"""Orthonormal bases of Krylov spaces by Lanczos with full reorthogonalisation."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sb3_crpn.cubic.step import (
+    EPS,
+    Array,
+    ArrayLike,
+    CountedOperator,
+    Operator,
+    as_vector,
+    at_least,
+)
+
+# krylov_basis takes a space for invariant where the remainder is below this multiple of EPS·‖A‖:
+# repeated eigenvalues left 5 to 27 for d = 30 to 3000, once 150 for d = 10
+_BREAKDOWN = 200.0
+
+
+class KrylovSpace:
+    """Orthonormal basis Q [k, d] (rows) of a few Krylov chains of A, and P = QAQᵀ.
+
+    A chain grows from a start vector by Lanczos with full reorthogonalisation, one product a
+    vector. Its *end* is the part of its last product that the space lacks, so that
+    ``A Qᵀy - QᵀPy = Σ_chains y_last·end``: the residual of anything solved in the space is known
+    without a product. An end is None where the chain has broken down, its end below
+    ``breakdown``·EPS·‖A‖; the default keeps all that could show in a residual. The space depends
+    on A and the starts only, so that solving for another α costs no product.
+    """
+
+    def __init__(self, operator: CountedOperator, like: Tensor, breakdown: float = 1.0) -> None:
+        self.operator = operator
+        self.breakdown = breakdown
+        self.dim = like.numel()
+        self.size = 0
+        self.projected: Array = np.zeros((0, 0))
+        self.chains: list[list[int]] = []
+        self.ends: list[Tensor | None] = []
+        self.norm = 0.0  # the largest ‖Aq‖ so far
+        self._rows = like.new_empty(min(self.dim, 16), self.dim)
+
+    @property
+    def basis(self) -> Tensor:
+        """Q, Tensor[k, d]."""
+        return self._rows[: self.size]
+
+    def open(self, start: Tensor) -> int:
+        """Begin a chain at ``start`` (≠ 0) and return its number; no product yet."""
+        self.chains.append([])
+        self.ends.append(self._end(start, float(torch.linalg.vector_norm(start))))
+        return len(self.chains) - 1
+
+    def extend(self, chain: int) -> None:
+        """Add the end of ``chain`` to the basis, at the cost of one product."""
+        end = self.ends[chain]
+        if end is None:
+            return
+        q = self._outside(end / torch.linalg.vector_norm(end))
+        self._append(q / torch.linalg.vector_norm(q))
+        self.chains[chain].append(self.size - 1)
+
+        product = self.operator(self._rows[self.size - 1])
+        self.norm = max(self.norm, float(torch.linalg.vector_norm(product)))
+        column = (self.basis @ product).cpu().numpy()
+        self.projected = np.pad(self.projected, (0, 1))
+        self.projected[-1, :] = self.projected[:, -1] = column
+        self.ends[chain] = product
+        self.ends = [None if e is None else self._end(e, self.norm) for e in self.ends]
+
+    def _append(self, row: Tensor) -> None:
+        if self.size == len(self._rows):
+            more = min(self.dim, 2 * self.size) - self.size
+            self._rows = torch.cat([self._rows, self._rows.new_empty(more, self.dim)])
+        self._rows[self.size] = row
+        self.size += 1
+
+    def _end(self, vector: Tensor, scale: float) -> Tensor | None:
+        outside = self._outside(self._outside(vector))  # twice is enough (Kahan, in Parlett 1980)
+        noise = self.breakdown * EPS * scale
+        full = self.size == self.dim
+        return None if full or float(torch.linalg.vector_norm(outside)) <= noise else outside
+
+    def _outside(self, vector: Tensor) -> Tensor:
+        return vector - self.basis.T @ (self.basis @ vector)
+
+
+def krylov_basis(matvec: Operator, start: ArrayLike, dim: int) -> Tensor:
+    """Orthonormal basis of the Krylov space span{b, Ab, …, A^{dim-1}b}, A symmetric.
+
+    Lanczos with full reorthogonalisation. ``matvec`` is called exactly once per column, with
+    that column and in order, the last one included: a caller that records the products has AQ.
+
+    Parameters
+    ----------
+    matvec
+        v ↦ Av, float64 Tensor[d] to Tensor[d].
+    start
+        b, [d]. Zero spans nothing: k = 0.
+    dim
+        Columns wanted, ≥ 1.
+
+    Returns
+    -------
+    Tensor
+        Q, [d, k], float64, k ≤ dim; fewer where the space is invariant before.
+
+    Raises
+    ------
+    ValueError
+        For an empty or non-finite ``start``, a non-finite product, dim < 1.
+    """
+    vector = as_vector("start", start)
+    space = KrylovSpace(CountedOperator("matvec", matvec), vector, _BREAKDOWN)
+    chain = space.open(vector)
+    for _ in range(at_least("dim", dim, 1)):
+        space.extend(chain)
+    return space.basis.T.contiguous()

@@ -1,0 +1,112 @@
+"""The cubic model in coordinates where its Hessian is diagonal: the secular equation."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_crpn.cubic.step import Array
+
+# Measured on 40 000 generated problems: 2.0 in the mean, more than 7 in 0.1 %, at most 11
+_MAX_ITERATIONS = 50
+
+# Convergence is quadratic: after a relative step of 1e-8 the error is rounding
+_LAST_STEP = 1e-8
+
+
+class SecularSolution(NamedTuple):
+    """Global minimiser y [k], the decrease -m(y) ≥ 0 and the iterations that it took."""
+
+    coordinates: Array
+    decrease: float
+    iterations: int
+
+
+def solve_secular(eigenvalues: Array, gamma: Array, alpha: float) -> SecularSolution:
+    r"""Minimise the diagonal cubic model globally.
+
+    .. math:: \min_y\; \gamma \cdot y + \tfrac12 \sum_i \lambda_i y_i^2 + \tfrac\alpha6 \|y\|^3
+
+    The minimiser is y = -γ/(λ_i + λ) with λ = ρ‖y‖, ρ = α/2 and λ ≥ λ̄ = max(0, -λ_1): the secular
+    equation. Its unknown is μ = λ - λ̄ ≥ 0, the distance from the pole; λ itself would lose the
+    digits of a nearly hard case. In the hard case (γ vanishes on the leftmost eigenspace and what
+    is left is too short) μ = 0 and the leftmost eigenvector makes up the length.
+
+    Units are chosen so that ρ = 1 and all numbers are O(1): with c = max(‖λ‖_∞, √(ρ‖γ‖)),
+    eigenvalues are measured in c, γ in c²/ρ, y in c/ρ.
+
+    Parameters
+    ----------
+    eigenvalues
+        λ_i, ascending, array[k]; k = 0 is allowed.
+    gamma
+        γ, the gradient's coordinates, array[k].
+    alpha
+        α > 0.
+    """
+    rho = alpha / 2
+    largest = float(np.max(np.abs(eigenvalues), initial=0.0))
+    unit = max(largest, math.sqrt(rho) * math.sqrt(_norm(gamma)))
+    if unit == 0:
+        return SecularSolution(np.zeros_like(gamma), 0.0, 0)
+    w = (gamma / unit) * (rho / unit)
+    w[np.abs(w) < np.finfo(np.float64).tiny] = 0  # subnormal numbers carry no digits
+    shift = max(0.0, -float(eigenvalues[0]) / unit)
+    a = eigenvalues / unit + shift
+
+    mu, iterations = _root(a, w, shift)
+    y = -_quotient(w, a + mu)
+    if mu == 0:
+        y[0] += _hard_case_length(_norm(y), shift)
+    # at a stationary point -m(y) = -½ γ·y + (ρ/6)‖y‖³: two terms ≥ 0, no cancellation
+    decrease = unit * (unit / rho) ** 2 * (_norm(y) ** 3 / 6 - float(w @ y) / 2)
+    return SecularSolution(y * (unit / rho), decrease, iterations)
+
+
+def _root(a: Array, w: Array, shift: float) -> tuple[float, int]:
+    """Solve ``‖w/(a + μ)‖ = μ + shift`` for μ ≥ 0; 0 if the left side is smaller there.
+
+    1/‖s‖ is linearised and 1/λ kept exact: with n = ‖z‖, z = w/(a + μ), λ = μ + shift and
+    p = Σ(z_i/n)²/(a_i + μ), the step δ solves (1 + pδ)(λ + δ) = n. As 1/‖s‖ is concave in μ, the
+    iterates grow monotonically towards the root from any lower bound: the first that is not
+    below it is it, to rounding.
+    """
+    mu = _lower_bound(a, w, shift)
+    for iteration in range(_MAX_ITERATIONS):
+        z = _quotient(w, a + mu)
+        n, lam = _norm(z), mu + shift
+        if n <= lam:
+            return mu, iteration
+        p = float(np.sum(_quotient((z / n) ** 2, a + mu)))
+        b = 1 + p * lam
+        excess = (n - lam) / b
+        delta = 2 * excess / (1 + math.sqrt(1 + 4 * (p / b) * excess))
+        mu += delta
+        if delta <= _LAST_STEP * mu:
+            return mu, iteration + 1
+    return mu, _MAX_ITERATIONS  # pragma: no cover
+
+
+def _lower_bound(a: Array, w: Array, shift: float) -> float:
+    """Return the largest root of the single equations ``(a_i + μ)(shift + μ) = |w_i|``, or 0."""
+    size = np.abs(w)
+    discriminant = np.sqrt((a - shift) ** 2 + 4 * size)
+    roots = _quotient(2 * np.maximum(size - a * shift, 0), a + shift + discriminant)
+    return float(np.max(roots))
+
+
+def _hard_case_length(length: float, shift: float) -> float:
+    """Return τ with ``length² + τ² = shift²``: how far to go along the leftmost eigenvector."""
+    return math.sqrt(max(0.0, (shift - length) * (shift + length)))
+
+
+def _quotient(numerator: Array, denominator: Array) -> Array:
+    """Divide, with 0/0 = 0: a direction without gradient takes no part."""
+    out: Array = np.zeros_like(numerator)
+    return np.divide(numerator, denominator, out=out, where=numerator != 0)
+
+
+def _norm(x: Array) -> float:
+    """Euclidean norm without overflow or underflow of the squares."""
+    largest = float(np.max(np.abs(x), initial=0.0))
+    return largest * float(np.linalg.norm(x / largest)) if largest > 0 else 0.0
