@@ -1,0 +1,157 @@
+"""A batch of whole episodes laid end to end, and linear recursions over it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from scipy.signal import lfilter
+
+FloatArray: TypeAlias = npt.NDArray[np.float64]
+IntArray: TypeAlias = npt.NDArray[np.int64]
+Observations: TypeAlias = torch.Tensor | dict[str, torch.Tensor]
+
+
+def episode_starts(lengths: IntArray) -> IntArray:
+    """Return the position of each episode's first step, [E], of episodes laid end to end."""
+    return np.cumsum(lengths) - lengths
+
+
+def episode_time(lengths: IntArray) -> IntArray:
+    """Return the time i = 0, 1, … of each step within its episode, [T]."""
+    time: IntArray = np.arange(lengths.sum()) - np.repeat(episode_starts(lengths), lengths)
+    return time
+
+
+def episode_scan(
+    values: FloatArray, factor: float, lengths: IntArray, *, reverse: bool = False
+) -> FloatArray:
+    """Solve y_i = x_i + factor · y_{i-1} within each episode, without a Python loop.
+
+    One filter runs over all steps; what an episode inherits from the one before it decays as
+    factor^(i+1) and is taken off again.
+
+    Parameters
+    ----------
+    values
+        x, shape [T] or [T, k], episodes end to end.
+    factor
+        In [0, 1].
+    lengths
+        Steps of each episode, [E], all positive, Σ = T.
+    reverse
+        Run backwards in time: y_i = x_i + factor · y_{i+1}.
+
+    Returns
+    -------
+    FloatArray
+        y, shape of ``values``.
+    """
+    if reverse:
+        return episode_scan(values[::-1], factor, lengths[::-1])[::-1]
+    filtered: FloatArray = lfilter([1.0], [1.0, -factor], values, axis=0)
+    inherited = np.zeros((len(lengths), *filtered.shape[1:]))
+    inherited[1:] = filtered[episode_starts(lengths)[1:] - 1]
+    decay = factor ** (episode_time(lengths) + 1.0)
+    columns = (-1, *[1] * (filtered.ndim - 1))
+    own: FloatArray = filtered - decay.reshape(columns) * np.repeat(inherited, lengths, axis=0)
+    return own
+
+
+def generalized_advantages(
+    rewards: FloatArray,
+    values: FloatArray,
+    terminal_values: FloatArray,
+    lengths: IntArray,
+    gamma: float,
+    gae_lambda: float,
+) -> FloatArray:
+    """Return GAE(λ) advantages Σ_l (γλ)^l δ_{i+l}, δ_i = r_i + γ V(s_{i+1}) - V(s_i), [T].
+
+    Parameters
+    ----------
+    rewards, values
+        r_i and V(s_i), [T].
+    terminal_values
+        V of the state after each episode's last step, [E]: 0 where the episode terminated.
+
+    References
+    ----------
+    Schulman et al., High-dimensional continuous control using generalized advantage estimation,
+    ICLR 2016, eq. 16.
+    """
+    next_values = np.append(values[1:], 0.0)
+    next_values[episode_starts(lengths) + lengths - 1] = terminal_values
+    delta = rewards + gamma * next_values - values
+    return episode_scan(delta, gamma * gae_lambda, lengths, reverse=True)
+
+
+@dataclass(frozen=True)
+class EpisodeBatch:
+    """E whole episodes of T steps in all, laid end to end.
+
+    Attributes
+    ----------
+    observations, actions
+        Tensors of first dimension T (one per key for dict observations), as the policy takes them.
+    lengths
+        Steps of each episode, [E].
+    weights
+        A_i of DESIGN section 2, [T]: the cost-to-go, less a baseline; positive is bad.
+    values, returns
+        The critic's V(s_i) and its regression target, the λ-return, [T].
+    """
+
+    observations: Observations
+    actions: torch.Tensor
+    lengths: IntArray
+    weights: FloatArray
+    values: FloatArray
+    returns: FloatArray
+
+    @property
+    def n_episodes(self) -> int:
+        """E, the number of episodes."""
+        return len(self.lengths)
+
+    @property
+    def n_steps(self) -> int:
+        """T, the number of steps."""
+        return len(self.weights)
+
+    def take(self, episodes: IntArray) -> EpisodeBatch:
+        """Return the batch of the chosen episodes, in the order given."""
+        lengths = self.lengths[episodes]
+        steps = np.repeat(episode_starts(self.lengths)[episodes], lengths) + episode_time(lengths)
+        return EpisodeBatch(
+            observations=map_observations(self.observations, lambda tensor: tensor[steps]),
+            actions=self.actions[steps],
+            lengths=lengths,
+            weights=self.weights[steps],
+            values=self.values[steps],
+            returns=self.returns[steps],
+        )
+
+    def split(self, n_groups: int) -> list[EpisodeBatch]:
+        """Deal the episodes in turn into at most ``n_groups`` batches, none of them empty.
+
+        The episodes are independent and identically distributed, so any split that does not look
+        at them is a random one.
+        """
+        n_groups = min(n_groups, self.n_episodes)
+        if n_groups == 1:
+            return [self]
+        return [self.take(np.arange(k, self.n_episodes, n_groups)) for k in range(n_groups)]
+
+
+def map_observations(
+    observations: Observations, function: Callable[[torch.Tensor], torch.Tensor]
+) -> Observations:
+    """Apply ``function`` to the observation tensor, or to each one of a dict."""
+    if isinstance(observations, dict):
+        return {key: function(tensor) for key, tensor in observations.items()}
+    return function(observations)

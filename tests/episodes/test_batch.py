@@ -1,0 +1,131 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_crpn.episodes import EpisodeBatch, episode_scan
+from sb3_crpn.episodes.batch import (
+    episode_starts,
+    episode_time,
+    generalized_advantages,
+    map_observations,
+)
+
+LENGTHS = st.lists(st.integers(1, 7), min_size=1, max_size=6)
+FACTORS = st.sampled_from([0.0, 0.5, 0.99, 1.0])
+SEEDS = st.integers(0, 10_000)
+
+
+def naive_scan(values, factor, lengths, reverse):
+    result = np.array(values)
+    for start, length in zip(episode_starts(lengths), lengths, strict=True):
+        steps = range(start + 1, start + length)
+        for i in reversed([k - 1 for k in steps]) if reverse else steps:
+            result[i] += factor * result[i + 1 if reverse else i - 1]
+    return result
+
+
+@given(LENGTHS, FACTORS, SEEDS, st.booleans(), st.sampled_from([(), (1,), (3,)]))
+@settings(deadline=None)
+def test_scan_is_the_recursion_within_each_episode(lengths, factor, seed, reverse, trailing):
+    lengths = np.array(lengths)
+    values = np.random.default_rng(seed).normal(size=(lengths.sum(), *trailing))
+    original = values.copy()
+    result = episode_scan(values, factor, lengths, reverse=reverse)
+    np.testing.assert_allclose(
+        result, naive_scan(values, factor, lengths, reverse), rtol=1e-12, atol=1e-12
+    )
+    assert np.array_equal(values, original)
+
+
+def test_scan_of_a_long_batch_keeps_its_precision():
+    lengths = np.array([50_000, 1, 50_000])
+    values = np.ones(lengths.sum())
+    expected = episode_time(lengths) + 1.0
+    assert np.array_equal(episode_scan(values, 1.0, lengths), expected)
+
+
+@given(LENGTHS, FACTORS, FACTORS, SEEDS)
+@settings(deadline=None)
+def test_advantages_are_the_discounted_sums_of_residuals(lengths, gamma, gae_lambda, seed):
+    lengths = np.array(lengths)
+    rng = np.random.default_rng(seed)
+    rewards, values = rng.normal(size=(2, lengths.sum()))
+    terminal_values = rng.normal(size=len(lengths))
+    expected = []
+    for e, start in enumerate(episode_starts(lengths)):
+        length = lengths[e]
+        V = np.append(values[start : start + length], terminal_values[e])
+        delta = rewards[start : start + length] + gamma * V[1:] - V[:-1]
+        for i in range(length):
+            decay = (gamma * gae_lambda) ** np.arange(length - i)
+            expected.append(decay @ delta[i:])
+    advantages = generalized_advantages(
+        rewards, values, terminal_values, lengths, gamma, gae_lambda
+    )
+    np.testing.assert_allclose(advantages, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_time_and_starts_of_episodes_laid_end_to_end():
+    lengths = np.array([2, 1, 3])
+    assert episode_starts(lengths).tolist() == [0, 2, 3]
+    assert episode_time(lengths).tolist() == [0, 1, 0, 0, 1, 2]
+
+
+def numbered_batch(lengths, *, is_dict=False):
+    """Every array holds the number of its step."""
+    steps = np.arange(float(sum(lengths)))
+    tensor = torch.from_numpy(steps)
+    return EpisodeBatch(
+        observations={"a": tensor, "b": -tensor[:, None]} if is_dict else tensor[:, None],
+        actions=tensor.long(),
+        lengths=np.array(lengths),
+        weights=steps,
+        values=steps + 0.5,
+        returns=-steps,
+    )
+
+
+@pytest.mark.parametrize("is_dict", [False, True])
+def test_take_selects_whole_episodes_in_the_order_given(is_dict):
+    batch = numbered_batch([2, 1, 3], is_dict=is_dict)
+    taken = batch.take(np.array([2, 0]))
+    steps = [3, 4, 5, 0, 1]
+    assert taken.n_episodes == 2
+    assert taken.n_steps == 5
+    assert taken.lengths.tolist() == [3, 2]
+    assert taken.actions.tolist() == steps
+    assert taken.weights.tolist() == steps
+    assert taken.values.tolist() == [i + 0.5 for i in steps]
+    assert taken.returns.tolist() == [-i for i in steps]
+    if is_dict:
+        assert taken.observations["a"].tolist() == steps
+        assert taken.observations["b"].tolist() == [[-i] for i in steps]
+    else:
+        assert taken.observations.tolist() == [[i] for i in steps]
+
+
+@given(LENGTHS, st.integers(1, 8))
+@settings(deadline=None)
+def test_split_deals_every_episode_once(lengths, n_groups):
+    batch = numbered_batch(lengths)
+    groups = batch.split(n_groups)
+    sizes = [group.n_episodes for group in groups]
+    assert len(groups) == min(n_groups, len(lengths))
+    assert max(sizes) - min(sizes) <= 1
+    steps = np.concatenate([group.weights for group in groups])
+    assert np.array_equal(np.sort(steps), batch.weights)
+    for group in groups:
+        starts = episode_starts(group.lengths)
+        assert np.array_equal(
+            group.weights,
+            episode_time(group.lengths) + np.repeat(group.weights[starts], group.lengths),
+        )
+    assert batch.split(1) == [batch]
+
+
+def test_map_observations_reaches_every_key():
+    doubled = map_observations({"a": torch.ones(2)}, lambda tensor: 2.0 * tensor)
+    assert doubled["a"].tolist() == [2.0, 2.0]
+    assert map_observations(torch.ones(1), torch.neg).tolist() == [-1.0]
