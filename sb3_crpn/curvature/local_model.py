@@ -1,0 +1,167 @@
+"""The cubic model around θ, on all of ℝᵈ or on a subspace, in coordinates where M = I."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+from sb3_crpn.cubic import krylov_basis
+from sb3_crpn.curvature.estimate import CurvatureEstimate, EpisodeOperator, relative_noise
+
+
+@dataclass(frozen=True)
+class LocalModel:
+    """m(y) = g·y + ½ yᵀ(ωH)y + (α/6)‖y‖³ on the steps s = basis · y, with ‖s‖_M = ‖y‖.
+
+    Attributes
+    ----------
+    gradient
+        g in these coordinates, [k].
+    hessian
+        H in these coordinates, [k, k], times ω; ``None`` when only products are known.
+    product
+        y ↦ ωH y.
+    basis
+        [d, k]; ``None`` for the identity.
+    shrinkage
+        ω.
+    lambda_min
+        Leftmost eigenvalue of H (not shrunk) on the basis, relative to M; nan when unknown.
+    products
+        Hessian-vector products spent on the model.
+    """
+
+    gradient: torch.Tensor
+    hessian: torch.Tensor | None
+    product: Callable[[torch.Tensor], torch.Tensor]
+    basis: torch.Tensor | None
+    shrinkage: float
+    lambda_min: float
+    products: int
+
+    def lift(self, coordinates: torch.Tensor) -> torch.Tensor:
+        """Return the step s = basis · y, [d]."""
+        return coordinates if self.basis is None else self.basis @ coordinates
+
+
+def full_model(estimate: CurvatureEstimate, shrinkage: float) -> LocalModel:
+    """Return the model on all of ℝᵈ in the Euclidean metric, H known by its products."""
+    return LocalModel(
+        gradient=estimate.gradient,
+        hessian=None,
+        product=lambda vector: shrinkage * (estimate.hessian @ vector),
+        basis=None,
+        shrinkage=shrinkage,
+        lambda_min=float("nan"),
+        products=0,
+    )
+
+
+def projected_model(
+    estimate: CurvatureEstimate,
+    *,
+    damping: float | None,
+    dim: int | None,
+    shrinkage: float | None,
+) -> LocalModel:
+    """Return the model on a subspace, with its matrices written out.
+
+    The subspace is ℝᵈ itself (``dim=None``), or the Krylov space K(H, g) of the Euclidean metric,
+    or K(F, g) of the Fisher metric. On the last, H = 0 gives TRPO's natural-gradient step by
+    ``dim`` conjugate-gradient iterations.
+
+    Parameters
+    ----------
+    estimate
+        g, H and F.
+    damping
+        ε of M = F + εI; ``None``: the Euclidean metric, M = I.
+    dim
+        Dimension of the Krylov space.
+    shrinkage
+        ω; ``None``: estimated by :func:`james_stein`.
+    """
+    basis, group_products, fisher_products = _subspace(estimate, damping is not None, dim)
+    gradient = basis.T @ estimate.gradient
+    hessians = basis.T @ group_products  # [K, k, k]
+    if damping is not None:
+        # VᵀFV = QΛQᵀ and s = VQ(Λ + ε)^(-½) y make the M-norm of s the Euclidean norm of y;
+        # F ⪰ 0, so that a negative eigenvalue is rounding
+        fisher = basis.T @ fisher_products
+        eigenvalues, vectors = torch.linalg.eigh(0.5 * (fisher + fisher.T))
+        whiten = ((eigenvalues.clamp(min=0.0) + damping) ** -0.5)[:, None] * vectors.T
+        basis = basis @ whiten.T
+        gradient = whiten @ gradient
+        hessians = whiten @ hessians @ whiten.T
+    hessians = 0.5 * (hessians + hessians.transpose(1, 2))
+    hessian = estimate.hessian.mean(hessians)
+    omega = (
+        james_stein(hessians, estimate.hessian.weights.to(hessians.device))
+        if shrinkage is None
+        else shrinkage
+    )
+    shrunk = omega * hessian
+    return LocalModel(
+        gradient=gradient,
+        hessian=shrunk,
+        product=lambda vector: shrunk @ vector,
+        basis=basis,
+        shrinkage=omega,
+        lambda_min=float(torch.linalg.eigvalsh(hessian)[0]),
+        products=basis.shape[1],
+    )
+
+
+def _subspace(
+    estimate: CurvatureEstimate, fisher: bool, dim: int | None
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return an orthonormal basis V [d, k], the groups' H_k V [K, d, k] and, if asked, F V."""
+    hessian, metric = _Recorder(estimate.hessian), _Recorder(estimate.fisher)
+    generator_of_basis = metric if fisher else hessian
+    if dim is None:
+        size = estimate.hessian.shape[0]
+        basis = torch.eye(size, dtype=torch.float64, device=estimate.gradient.device)
+    else:
+        basis = krylov_basis(generator_of_basis, _start(estimate.gradient), dim)
+    for recorder in (hessian, metric) if fisher else (hessian,):
+        if not recorder.columns:
+            for column in basis.T:
+                recorder(column)
+    products = torch.stack(hessian.columns, dim=2)
+    if not fisher:
+        return basis, products, basis
+    return basis, products, estimate.fisher.mean(torch.stack(metric.columns, dim=2))
+
+
+def _start(gradient: torch.Tensor) -> torch.Tensor:
+    """Return the gradient, or a fixed random direction where it vanishes exactly."""
+    if gradient.any():
+        return gradient
+    generator = torch.Generator().manual_seed(0)
+    return torch.randn(len(gradient), dtype=torch.float64, generator=generator).to(gradient.device)
+
+
+class _Recorder:
+    """v ↦ Bv, keeping the groups' B_k v of every call."""
+
+    def __init__(self, operator: EpisodeOperator) -> None:
+        self._operator = operator
+        self.columns: list[torch.Tensor] = []
+
+    def __call__(self, vector: torch.Tensor) -> torch.Tensor:
+        products = self._operator.group_products(vector)
+        self.columns.append(products)
+        return self._operator.mean(products)
+
+
+def james_stein(hessians: torch.Tensor, weights: torch.Tensor) -> float:
+    """Return ω = max(0, 1 - E‖noise‖²_F / ‖H‖²_F), H = Σ_k w_k H_k, from groups H_k [K, k, k].
+
+    The positive-part James-Stein factor (James and Stein, 1961) with the noise measured by the
+    disagreement of the groups. ω → 1 as the groups grow. From one group alone the noise cannot be
+    measured; 0, a first-order step, is then the safe answer.
+    """
+    noise = relative_noise(hessians, weights)
+    return max(0.0, 1.0 - noise) if noise == noise else 0.0

@@ -1,0 +1,188 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from sb3_crpn.cubic import solve_dense
+from sb3_crpn.curvature import PairWeights, estimate_curvature, full_model, projected_model
+from sb3_crpn.curvature.local_model import james_stein
+from tests.policies import frozen_episodes, small_policy
+
+ALPHA = 3.0
+LENGTHS = (3, 1, 4, 2, 5, 3)
+
+
+def estimate_of(lengths=LENGTHS):
+    policy, actor = small_policy("discrete")
+    batch = frozen_episodes(policy, lengths)
+    return estimate_curvature(policy, actor, batch, batch, PairWeights("causal", 0.9))
+
+
+@pytest.fixture(scope="module")
+def estimate():
+    return estimate_of()
+
+
+def metric_of(estimate, damping):
+    identity = torch.eye(estimate.hessian.shape[0], dtype=torch.float64)
+    return identity if damping is None else estimate.fisher.to_dense() + damping * identity
+
+
+def model_value(gradient, hessian, norm, x):
+    return gradient @ x + 0.5 * x @ hessian @ x + ALPHA / 6.0 * norm**3
+
+
+@pytest.mark.parametrize("dim", [None, 5])
+@pytest.mark.parametrize("damping", [None, 0.1])
+def test_the_model_in_coordinates_is_the_model_of_the_step(estimate, damping, dim):
+    model = projected_model(estimate, damping=damping, dim=dim, shrinkage=0.7)
+    M, H = metric_of(estimate, damping), estimate.hessian.to_dense()
+    size = len(estimate.gradient) if dim is None else dim
+    assert model.products == size
+    assert model.shrinkage == 0.7
+    assert model.basis.shape == (len(estimate.gradient), size)
+    torch.testing.assert_close(model.hessian, model.hessian.T, rtol=0, atol=0)
+    identity = torch.eye(size, dtype=torch.float64)
+    torch.testing.assert_close(model.basis.T @ M @ model.basis, identity, rtol=0, atol=1e-9)
+    for y in torch.randn(3, size, dtype=torch.float64, generator=torch.Generator().manual_seed(0)):
+        s = model.lift(y)
+        torch.testing.assert_close((s @ M @ s).sqrt(), y.norm())
+        torch.testing.assert_close(model.product(y), model.hessian @ y)
+        torch.testing.assert_close(
+            model_value(model.gradient, model.hessian, y.norm(), y),
+            model_value(estimate.gradient, 0.7 * H, (s @ M @ s).sqrt(), s),
+        )
+
+
+@pytest.mark.parametrize("damping", [None, 0.1])
+def test_the_subspace_is_the_krylov_space_of_the_metric(estimate, damping):
+    model = projected_model(estimate, damping=damping, dim=4, shrinkage=1.0)
+    generator = (estimate.hessian if damping is None else estimate.fisher).to_dense()
+    vector = estimate.gradient
+    for _ in range(4):
+        inside = model.basis @ torch.linalg.lstsq(model.basis, vector).solution
+        torch.testing.assert_close(inside, vector, rtol=1e-6, atol=1e-8 * float(vector.norm()))
+        vector = generator @ vector
+    outside = vector - model.basis @ torch.linalg.lstsq(model.basis, vector).solution
+    assert outside.norm() > 1e-6 * vector.norm()
+
+
+@pytest.mark.parametrize("damping", [None, 0.1])
+def test_leftmost_eigenvalue_is_that_of_the_unshrunk_hessian(estimate, damping):
+    model = projected_model(estimate, damping=damping, dim=None, shrinkage=0.1)
+    M, H = metric_of(estimate, damping), estimate.hessian.to_dense()
+    eigenvalues = torch.linalg.eigvals(torch.linalg.solve(M, H)).real
+    assert model.lambda_min == pytest.approx(eigenvalues.min().item(), abs=1e-9)
+
+
+@pytest.mark.parametrize("damping", [None, 0.1])
+@pytest.mark.parametrize("dim", [None, 4, 1000])
+def test_products_spent_are_those_counted(monkeypatch, damping, dim):
+    estimate = estimate_of()
+    spent = []
+    products = estimate.hessian.group_products
+    monkeypatch.setattr(
+        estimate.hessian, "group_products", lambda v: spent.append(1) or products(v)
+    )
+    model = projected_model(estimate, damping=damping, dim=dim, shrinkage=None)
+    assert len(spent) == model.products == model.basis.shape[1] <= len(estimate.gradient)
+
+
+@pytest.mark.parametrize("damping", [None, 0.1])
+def test_a_vanishing_gradient_still_has_a_model(damping):
+    estimate = estimate_of()
+    estimate.gradient.zero_()
+    model = projected_model(estimate, damping=damping, dim=3, shrinkage=1.0)
+    assert model.basis.shape[1] == 3
+    assert not model.gradient.any()
+    assert model.hessian.any()
+
+
+def test_the_full_model_knows_the_hessian_by_products(estimate):
+    model = full_model(estimate, 0.5)
+    v = torch.ones_like(estimate.gradient)
+    assert model.hessian is None
+    assert model.products == 0
+    assert model.gradient is estimate.gradient
+    assert torch.equal(model.lift(v), v)
+    torch.testing.assert_close(model.product(v), 0.5 * (estimate.hessian @ v))
+
+
+@pytest.mark.parametrize("dim", [None, 4])
+@pytest.mark.parametrize("damping", [None, 0.1])
+def test_shrinkage_is_measured_between_two_groups_in_whitened_coordinates(damping, dim):
+    policy, actor = small_policy("gaussian")
+    batch = frozen_episodes(policy, (1,) * 301)
+    batch = replace(batch, weights=(batch.actions**2).sum(1).double().numpy())
+    estimate = estimate_curvature(policy, actor, batch, batch, PairWeights("causal", 0.9))
+    model = projected_model(estimate, damping=damping, dim=dim, shrinkage=None)
+    identity = torch.eye(len(estimate.gradient), dtype=torch.float64)
+    columns = [estimate.hessian.group_products(e) for e in identity]
+    first, second = model.basis.T @ torch.stack(columns, dim=2) @ model.basis
+    w = estimate.hessian.weights
+    assert w.tolist() == [151 / 301, 150 / 301]
+    total = w[0] * first + w[1] * second
+    noise = w[0] * w[1] * ((first - second) ** 2).sum() / (total**2).sum()
+    assert 0.0 < noise < 1.0
+    assert model.shrinkage == pytest.approx(1.0 - noise.item(), rel=1e-6)
+    torch.testing.assert_close(model.hessian, model.shrinkage * total, rtol=1e-6, atol=1e-9)
+
+
+def test_shrinkage_tends_to_one_as_groups_agree_and_to_none_in_noise():
+    H = torch.tensor([[2.0, 1.0], [1.0, -3.0]], dtype=torch.float64)
+    noise = torch.tensor([[1.0, -1.0], [-1.0, 0.5]], dtype=torch.float64)
+    weights = torch.tensor([0.5, 0.5], dtype=torch.float64)
+    factors = [
+        james_stein(torch.stack([H + size * noise, H - size * noise]), weights)
+        for size in (0.0, 0.1, 1.0, 10.0)
+    ]
+    assert factors[0] == 1.0
+    assert factors[1] == pytest.approx(1.0 - 0.01 * 3.25 / 15.0)
+    assert factors[1] > factors[2] > factors[3] == 0.0
+
+
+@pytest.mark.parametrize("damping", [None, 0.1])
+def test_one_episode_gives_a_first_order_step(damping):
+    estimate = estimate_of(lengths=(5,))
+    model = projected_model(estimate, damping=damping, dim=None, shrinkage=None)
+    assert model.shrinkage == 0.0
+    assert not model.hessian.any()
+    assert model.gradient.any()
+    assert james_stein(torch.ones(1, 2, 2), torch.ones(1)) == 0.0
+
+
+MIXING = torch.tensor([[2.0, -1.5], [0.3, 0.7]], dtype=torch.float64)
+
+
+def change_of_outputs(kind, mixing, damping):
+    """How a cubic step changes the outputs of the linear policy z = W (P x) + b, [T, …]."""
+    policy, actor = small_policy(kind, net_arch=(), mixing=mixing)
+    with torch.no_grad():
+        policy.action_net.weight.copy_(policy.action_net.weight @ torch.linalg.inv(mixing))
+    batch = frozen_episodes(small_policy(kind, net_arch=())[0], LENGTHS)
+    estimate = estimate_curvature(policy, actor, batch, batch, PairWeights("causal", 0.9))
+    model = projected_model(estimate, damping=damping, dim=None, shrinkage=None)
+    step = model.lift(solve_dense(model.gradient, model.hessian, ALPHA).step)
+
+    def outputs():
+        with torch.no_grad():
+            distribution = policy.get_distribution(batch.observations).distribution
+        if kind == "discrete":
+            return distribution.logits
+        return torch.cat([distribution.mean, distribution.stddev.log()], dim=1)
+
+    before = outputs()
+    actor.assign(actor.vector + step)
+    return outputs() - before
+
+
+@pytest.mark.parametrize("kind", ["discrete", "gaussian"])
+def test_only_the_fisher_step_is_free_of_the_parameterisation(kind):
+    identity = torch.eye(2, dtype=torch.float64)
+    plain, mixed = (change_of_outputs(kind, P, 1e-9) for P in (identity, MIXING))
+    scale = float(plain.abs().max())
+    assert scale > 1e-2
+    torch.testing.assert_close(mixed, plain, rtol=0, atol=1e-5 * scale)
+
+    plain, mixed = (change_of_outputs(kind, P, None) for P in (identity, MIXING))
+    assert (mixed - plain).abs().max() > 1e-2 * plain.abs().max()
