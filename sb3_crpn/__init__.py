@@ -1,0 +1,24 @@
+"""Cubic-regularised policy Newton algorithms for Stable-Baselines3.
+
+``CRPN`` and ``ACRPN`` are Stable-Baselines3 algorithms; ``PAPER`` holds the settings at which they
+are Algorithms 1 and 2 of Maniyar et al., AISTATS 2024.
+"""
+
+from sb3_crpn.acrpn import ACRPN
+from sb3_crpn.crpn import CRPN
+
+__all__ = ["ACRPN", "CRPN", "PAPER", "__version__"]
+
+__version__ = "0.1.0"
+
+PAPER = {
+    "target_kl": None,
+    "metric": "euclidean",
+    "hessian_estimator": "trajectory",
+    "hessian_shrinkage": None,
+    "baseline": False,
+    "gae_lambda": 1.0,
+    "normalize_advantage": False,
+    "discount_visitation": True,
+    "bootstrap_truncated": False,
+}

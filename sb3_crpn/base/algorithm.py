@@ -1,0 +1,441 @@
+"""PolicyNewtonAlgorithm: what CRPN and ACRPN have in common."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, TypeVar
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.policies import (
+    ActorCriticCnnPolicy,
+    ActorCriticPolicy,
+    BasePolicy,
+    MultiInputActorCriticPolicy,
+)
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule, explained_variance
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_crpn.base.arguments import check_arguments, check_integer
+from sb3_crpn.base.collection import EpisodeCollection
+from sb3_crpn.base.critic import fit_critic
+from sb3_crpn.base.random_state import RandomState
+from sb3_crpn.base.trial import StepTester, Trial, fit_alpha
+from sb3_crpn.cubic import CubicStep
+from sb3_crpn.curvature import (
+    CurvatureEstimate,
+    LocalModel,
+    PairWeights,
+    estimate_curvature,
+    full_model,
+    projected_model,
+)
+from sb3_crpn.curvature.scores import HessianEstimator
+from sb3_crpn.episodes import DictEpisodeRolloutBuffer, EpisodeBatch, EpisodeRolloutBuffer
+from sb3_crpn.parameters import ActorParameters
+
+Self = TypeVar("Self", bound="PolicyNewtonAlgorithm")
+
+# Dimension of the Krylov space when the step's length is set by the KL divergence: the number of
+# conjugate-gradient iterations of sb3-contrib's TRPO, whose step H = 0 then reproduces.
+KRYLOV_DIM = 15
+
+
+@dataclass(frozen=True)
+class PolicyStep:
+    """What an update did to the actor: the cubic step, its α, its effect, and its acceptance."""
+
+    cubic: CubicStep
+    norm: float
+    alpha: float
+    trial: Trial
+    rejected: bool
+
+
+class PolicyNewtonAlgorithm(RandomState, EpisodeCollection):
+    """Base of the cubic-regularised policy Newton algorithms.
+
+    Each update minimises the cubic model of the cost J(θ) = -E[Σ_h γ^h r_h],
+
+        m(s) = g·s + ½ sᵀ(ωH)s + (α/6)‖s‖³_M,
+
+    with g and H estimated from whole episodes and M the Euclidean or the Fisher metric.
+
+    Parameters
+    ----------
+    policy
+        "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or an ``ActorCriticPolicy`` class.
+    env
+        Environment, vectorised environment or registered id.
+    learning_rate
+        The critic's, a float or a schedule. The actor has none: its step is the cubic model's.
+    n_steps
+        Target timesteps per environment and update, met in whole episodes of the last update's
+        mean length (at least one per environment).
+    n_episodes
+        m_k, the episodes of the gradient: an int or a schedule; ``None``: from ``n_steps``.
+    n_hessian_episodes
+        b_k, the episodes of the Hessian, likewise; ``None``: the gradient's. Where the two
+        differ, max(m_k, b_k) are simulated and each set is drawn without replacement.
+    alpha
+        α of the cubic term, a float or a schedule. With ``target_kl`` only the first guess.
+    target_kl
+        Mean KL divergence KL(old ‖ new) that each step keeps, met within 10 % by the choice of α;
+        ``None``: α follows its schedule.
+    metric
+        "fisher": M = F + εI; "euclidean": M = I, the paper's.
+    fisher_damping
+        ε > 0 of the Fisher metric.
+    hessian_estimator
+        "causal", or the paper's "trajectory".
+    hessian_lambda
+        κ in [0, 1], the decay of the causal estimator's cross-time terms: 1 is unbiased.
+    hessian_shrinkage
+        ω in [0, 1]; "auto": the James-Stein factor from two groups of episodes; ``None``: 1.
+    krylov_dim
+        Dimension of the Krylov space that steps are sought in; ``None``: 15 with ``target_kl`` or
+        the Fisher metric, else as large as the solver's certificate needs.
+    gamma
+        Discount factor.
+    gae_lambda
+        λ of the generalised advantage estimator; 1: episode returns-to-go.
+    baseline
+        Subtract the critic's V(s_i) from the returns-to-go.
+    normalize_advantage
+        Scale and shift the advantages to standard deviation 1 and mean 0 over each batch.
+    discount_visitation
+        Keep the factor γ^i of step i, which the derivatives of J have and which is usually
+        dropped.
+    bootstrap_truncated
+        Add γV(s_H) where a time limit ended the episode.
+    horizon
+        H, the step after which episodes are cut; ``None``: episodes end by themselves.
+    batch_size
+        Minibatch size of the critic.
+    n_critic_updates
+        Passes over the batch that fit the critic in each update, after the actor's step.
+    use_sde, sde_sample_freq, rollout_buffer_class, rollout_buffer_kwargs, stats_window_size
+        As in SB3's on-policy algorithms; the buffer class must be an ``EpisodeRolloutBuffer``.
+    tensorboard_log, policy_kwargs, verbose, seed, device, _init_setup_model
+        As in SB3's on-policy algorithms.
+
+    Raises
+    ------
+    ValueError
+        An argument is out of range; the message names it, its value and what is allowed.
+
+    References
+    ----------
+    Maniyar, Prashanth L.A., Mondal, Bhatnagar, A Cubic-regularized Policy Newton Algorithm for
+    Reinforcement Learning, AISTATS 2024.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": ActorCriticPolicy,
+        "CnnPolicy": ActorCriticCnnPolicy,
+        "MultiInputPolicy": MultiInputActorCriticPolicy,
+    }
+    actor: ActorParameters
+
+    def __init__(
+        self,
+        policy: str | type[ActorCriticPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-3,
+        n_steps: int = 1024,
+        n_episodes: int | Schedule | None = None,
+        n_hessian_episodes: int | Schedule | None = None,
+        alpha: float | Schedule = 1.0,
+        target_kl: float | None = 0.02,
+        metric: Literal["euclidean", "fisher"] = "fisher",
+        fisher_damping: float = 0.1,
+        hessian_estimator: HessianEstimator = "causal",
+        hessian_lambda: float = 0.9,
+        hessian_shrinkage: float | Literal["auto"] | None = "auto",
+        krylov_dim: int | None = None,
+        gamma: float = 0.99,
+        gae_lambda: float = 0.95,
+        baseline: bool = True,
+        normalize_advantage: bool = True,
+        discount_visitation: bool = False,
+        bootstrap_truncated: bool = True,
+        horizon: int | None = None,
+        batch_size: int = 128,
+        n_critic_updates: int = 10,
+        use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        rollout_buffer_class: type[EpisodeRolloutBuffer] | None = None,
+        rollout_buffer_kwargs: dict[str, Any] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: torch.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            n_steps=n_steps,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            ent_coef=0.0,
+            vf_coef=0.0,
+            max_grad_norm=0.0,
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            rollout_buffer_class=rollout_buffer_class,
+            rollout_buffer_kwargs=rollout_buffer_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+            supported_action_spaces=(
+                spaces.Box,
+                spaces.Discrete,
+                spaces.MultiDiscrete,
+                spaces.MultiBinary,
+            ),
+        )
+        self.n_episodes = n_episodes
+        self.n_hessian_episodes = n_hessian_episodes
+        self.alpha = alpha
+        self.target_kl = target_kl
+        self.metric = metric
+        self.fisher_damping = fisher_damping
+        self.hessian_estimator: HessianEstimator = hessian_estimator
+        self.hessian_lambda = hessian_lambda
+        self.hessian_shrinkage = hessian_shrinkage
+        self.krylov_dim = krylov_dim
+        self.baseline = baseline
+        self.normalize_advantage = normalize_advantage
+        self.discount_visitation = discount_visitation
+        self.bootstrap_truncated = bootstrap_truncated
+        self.horizon = horizon
+        self.batch_size = batch_size
+        self.n_critic_updates = n_critic_updates
+        self._fitted_alpha: float | None = None  # the last α that met target_kl
+        self._mean_episode_length = None
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        check_arguments(self)
+        if self.rollout_buffer_class is None:
+            is_dict = isinstance(self.observation_space, spaces.Dict)
+            self.rollout_buffer_class = (
+                DictEpisodeRolloutBuffer if is_dict else EpisodeRolloutBuffer
+            )
+        super()._setup_model()
+        self.alpha_schedule = FloatSchedule(self.alpha)
+        self.actor = self._find_actor()
+
+    def _find_actor(self) -> ActorParameters:
+        """Select the parameters that log π depends on, by gradient reachability."""
+        self.policy.set_training_mode(False)
+        zeros = _zero_observation(self.observation_space)
+        distribution = self.policy.get_distribution(self.policy.obs_to_tensor(zeros)[0])
+        log_prob = distribution.log_prob(distribution.mode().detach())
+        return ActorParameters.reachable(self.policy, log_prob)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "actor", "alpha_schedule"]
+
+    @property
+    def uses_critic(self) -> bool:
+        """Whether V enters the advantages at all."""
+        return self.baseline or self.bootstrap_truncated or self.gae_lambda < 1.0
+
+    def learn(
+        self: Self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """Train for at least ``total_timesteps``, as SB3's algorithms do."""
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name or type(self).__name__,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
+
+    def train(self) -> None:
+        """Update the policy from the episodes just collected (DESIGN section 5)."""
+        self.policy.set_training_mode(False)
+        self._update_learning_rate(self.policy.optimizer)
+        batch = self._episode_batch(self.rollout_buffer)
+        estimate = self._estimate(batch)
+        model = self._local_model(estimate)
+        step = self._take_step(estimate.gradient_batch, model)
+        value_loss = self._fit_critic(batch)
+        self._n_updates += 1
+        self._log_update(batch, estimate, model, step, value_loss)
+
+    def estimate_curvature(self, n_episodes: int, env: VecEnv | None = None) -> CurvatureEstimate:
+        """Estimate gradient and Hessian of J at the current policy from fresh episodes.
+
+        The estimators are those of the constructor's arguments; nothing is learnt, and the
+        episodes do not count as training.
+
+        Parameters
+        ----------
+        n_episodes
+            Number of episodes, used for the gradient and for the Hessian alike.
+        env
+            Where to simulate; ``None``: the training environment.
+        """
+        check_integer("n_episodes", n_episodes, 1)
+        batch = self._episode_batch(self._collect_fresh(n_episodes, env))
+        return estimate_curvature(self.policy, self.actor, batch, batch, self._pair_weights)
+
+    @property
+    def _pair_weights(self) -> PairWeights:
+        return PairWeights(self.hessian_estimator, self.hessian_lambda)
+
+    def _scheduled_episodes(self) -> tuple[int | None, int | None]:
+        progress = self._current_progress_remaining
+        numbers = []
+        for value in (self.n_episodes, self.n_hessian_episodes):
+            current = value(progress) if callable(value) else value
+            numbers.append(None if current is None else max(1, round(current)))
+        return numbers[0], numbers[1]
+
+    def _episode_batch(self, buffer: RolloutBuffer) -> EpisodeBatch:
+        assert isinstance(buffer, EpisodeRolloutBuffer)  # by _setup_model
+        return buffer.episode_batch(
+            baseline=self.baseline,
+            normalize_advantage=self.normalize_advantage,
+            discount_visitation=self.discount_visitation,
+        )
+
+    def _estimate(self, batch: EpisodeBatch) -> CurvatureEstimate:
+        """Estimate g from m_k and H from b_k of the episodes."""
+        m, b = self._scheduled_episodes()
+        gradient_batch = self._draw(batch, m)
+        hessian_batch = gradient_batch if b is None else self._draw(batch, b)
+        return estimate_curvature(
+            self.policy, self.actor, gradient_batch, hessian_batch, self._pair_weights
+        )
+
+    def _draw(self, batch: EpisodeBatch, n_episodes: int | None) -> EpisodeBatch:
+        """Draw episodes without replacement; all of them are the batch itself."""
+        if n_episodes is None or n_episodes >= batch.n_episodes:
+            return batch
+        return batch.take(self._rng.choice(batch.n_episodes, n_episodes, replace=False))
+
+    def _prefers_dense(self) -> bool:
+        """Whether the model is to be written out on all of ℝᵈ."""
+        return False
+
+    def _local_model(self, estimate: CurvatureEstimate) -> LocalModel:
+        """Build the cubic model, on a subspace unless the paper's full space is asked for."""
+        fisher = self.metric == "fisher"
+        shrinkage = 1.0 if self.hessian_shrinkage is None else self.hessian_shrinkage
+        unrestricted = self.krylov_dim is None and self.target_kl is None and not fisher
+        if not self._prefers_dense() and unrestricted and shrinkage != "auto":
+            return full_model(estimate, shrinkage)
+        dim = KRYLOV_DIM if self.krylov_dim is None else self.krylov_dim
+        return projected_model(
+            estimate,
+            damping=self.fisher_damping if fisher else None,
+            dim=None if self._prefers_dense() else dim,
+            shrinkage=None if shrinkage == "auto" else shrinkage,
+        )
+
+    def _solve(self, model: LocalModel, alpha: float) -> CubicStep:
+        """Minimise the cubic model: what CRPN and ACRPN differ in."""
+        raise NotImplementedError
+
+    def _take_step(self, batch: EpisodeBatch, model: LocalModel) -> PolicyStep:
+        """Choose α, move the actor, and move it back if the step is no good.
+
+        A step is rejected when the new policy is not finite, and with ``target_kl`` also when it
+        violates the target or raises the importance-weighted surrogate cost.
+        """
+        tester = StepTester(self.policy, self.actor, batch)
+
+        def attempt(alpha: float) -> tuple[CubicStep, torch.Tensor, Trial]:
+            cubic = self._solve(model, alpha)
+            step = model.lift(cubic.step)
+            return cubic, step, tester.try_step(step)
+
+        alpha = self.alpha_schedule(self._current_progress_remaining)
+        if self.target_kl is not None:
+            start = alpha if self._fitted_alpha is None else self._fitted_alpha
+            alpha = fit_alpha(lambda alpha: attempt(alpha)[2].kl, start, self.target_kl)
+        cubic, step, trial = attempt(alpha)
+        rejected = not trial.finite
+        if self.target_kl is not None and trial.finite:
+            self._fitted_alpha = alpha
+            rejected = trial.kl > self.target_kl or trial.surrogate_change > 0.0
+        if rejected:
+            tester.restore()
+        return PolicyStep(cubic, float(step.norm()), alpha, trial, rejected)
+
+    def _fit_critic(self, batch: EpisodeBatch) -> float | None:
+        """Regress V on the λ-returns; ``None`` where V is not used."""
+        if not self.uses_critic:
+            return None
+        return fit_critic(
+            self.policy,
+            self.actor,
+            batch,
+            n_epochs=self.n_critic_updates,
+            batch_size=self.batch_size,
+            rng=self._rng,
+        )
+
+    def _log_update(
+        self,
+        batch: EpisodeBatch,
+        estimate: CurvatureEstimate,
+        model: LocalModel,
+        step: PolicyStep,
+        value_loss: float | None,
+    ) -> None:
+        known = {
+            "gradient_norm": float(estimate.gradient.norm()),
+            "gradient_noise": estimate.gradient_noise,
+            "step_norm": 0.0 if step.rejected else step.norm,
+            "alpha": step.alpha,
+            "kl_divergence": 0.0 if step.rejected else step.trial.kl,
+            "surrogate_change": 0.0 if step.rejected else step.trial.surrogate_change,
+            "step_rejected": int(step.rejected),
+            "multiplier": step.cubic.multiplier,
+            "predicted_decrease": step.cubic.predicted_decrease,
+            "lambda_min": step.cubic.lambda_min if model.basis is None else model.lambda_min,
+            "hessian_vector_products": model.products or step.cubic.products,
+            "hessian_shrinkage": model.shrinkage,
+            "n_episodes": batch.n_episodes,
+            "explained_variance": explained_variance(batch.values, batch.returns),
+        }
+        for key, value in known.items():
+            self.logger.record(f"train/{key}", value)
+        if value_loss is not None:
+            self.logger.record("train/value_loss", value_loss)
+        assert isinstance(self.rollout_buffer, EpisodeRolloutBuffer)  # by _setup_model
+        self.logger.record("train/used_timesteps_fraction", self.rollout_buffer.used_fraction)
+        if hasattr(self.policy, "log_std"):
+            self.logger.record("train/std", torch.exp(self.policy.log_std).mean().item())
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+
+def _zero_observation(space: spaces.Space[Any]) -> Any:
+    """Return an observation of zeros."""
+    if isinstance(space, spaces.Dict):
+        return {key: _zero_observation(subspace) for key, subspace in space.spaces.items()}
+    return np.zeros(space.shape or (), dtype=space.dtype)

@@ -1,0 +1,158 @@
+import math
+
+import pytest
+import torch
+
+from sb3_crpn.base.trial import StepTester, Trial, fit_alpha
+from tests.policies import ACTION_SPACES, frozen_episodes, log_probabilities, small_policy
+
+TARGET = 0.02
+
+
+class Law:
+    """α ↦ KL that counts its trials."""
+
+    def __init__(self, function):
+        self.function = function
+        self.trials = 0
+
+    def __call__(self, alpha):
+        self.trials += 1
+        return self.function(alpha)
+
+
+@pytest.mark.parametrize("start", [1e-6, 1e-2, 1.0, 1e2, 1e6])
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
+@pytest.mark.parametrize("power", [0.5, 1.0, 2.0])
+def test_power_laws_are_met_in_a_few_trials(power, scale, start):
+    law = Law(lambda alpha: (scale / alpha) ** power)
+    alpha = fit_alpha(law, start, TARGET)
+    assert 0.9 * TARGET <= law(alpha) <= TARGET
+    assert law.trials <= 15
+
+
+def test_a_start_that_meets_the_target_is_kept():
+    law = Law(lambda alpha: 0.95 * TARGET / alpha)
+    assert fit_alpha(law, 1.0, TARGET) == 1.0
+    assert law.trials == 1
+
+
+@pytest.mark.parametrize("start", [1e-4, 1.0, 1e5])
+@pytest.mark.parametrize("invalid", [math.inf, math.nan])
+def test_steps_that_blow_up_count_as_too_long(invalid, start):
+    law = Law(lambda alpha: 1.0 / alpha if alpha > 30.0 else invalid)
+    alpha = fit_alpha(law, start, TARGET)
+    assert 0.9 * TARGET <= law(alpha) <= TARGET
+    assert law.trials <= 25
+
+
+@pytest.mark.parametrize("start", [1e-3, 1.0, 1e4])
+def test_saturating_law_that_reaches_the_target_is_met(start):
+    law = Law(lambda alpha: 2.0 * TARGET / (1.0 + alpha))
+    alpha = fit_alpha(law, start, TARGET)
+    assert 0.9 * TARGET <= law(alpha) <= TARGET
+    assert law.trials <= 15
+
+
+@pytest.mark.parametrize("start", [1e-3, 1.0, 1e4])
+@pytest.mark.parametrize("limit", [0.5, 1e-3])
+def test_a_newton_step_within_the_target_is_taken_nearly_in_full(limit, start):
+    law = Law(lambda alpha: limit * TARGET / (1.0 + alpha))
+    alpha = fit_alpha(law, start, TARGET)
+    assert 0.95 * limit * TARGET <= law(alpha) <= TARGET
+    assert law.trials <= 25
+
+
+def test_a_step_of_length_zero_leaves_alpha_alone():
+    law = Law(lambda alpha: 0.0)
+    assert fit_alpha(law, 2.0, TARGET) == pytest.approx(2.0)
+    assert law.trials <= 2
+
+
+@pytest.mark.parametrize("start", [1e-3, 1.0, 1e4])
+def test_where_the_target_is_jumped_over_alpha_is_the_smallest_allowed(start):
+    law = Law(lambda alpha: 5.0 * TARGET if alpha < 7.0 else 0.1 * TARGET * 7.0 / alpha)
+    alpha = fit_alpha(law, start, TARGET)
+    assert law(alpha) <= TARGET
+    assert alpha == pytest.approx(7.0, rel=1e-3)
+
+
+def test_a_policy_that_never_survives_ends_the_search():
+    law = Law(lambda alpha: math.nan)
+    assert math.isfinite(fit_alpha(law, 1.0, TARGET))
+    assert law.trials <= 50
+
+
+def attempt_of(kind, dtype=torch.float64):
+    policy, actor = small_policy(kind, dtype=dtype)
+    batch = frozen_episodes(policy)
+    generator = torch.Generator().manual_seed(0)
+    step = 0.1 * torch.randn(len(actor), dtype=torch.float64, generator=generator)
+    return policy, actor, batch, step
+
+
+@pytest.mark.parametrize("kind", ACTION_SPACES)
+def test_a_trial_measures_the_surrogate_cost_and_the_divergence(kind):
+    policy, actor, batch, step = attempt_of(kind)
+    before = log_probabilities(policy, batch).detach()
+    tester = StepTester(policy, actor, batch)
+    trial = tester.try_step(step)
+    ratio = (log_probabilities(policy, batch).detach() - before).exp()
+    change = (torch.from_numpy(batch.weights) * (ratio - 1.0)).sum() / batch.n_episodes
+    assert trial.surrogate_change == pytest.approx(change.item())
+    assert trial.finite
+
+    tester.restore()
+    observations = batch.observations.repeat(4000, 1)
+    reference = policy.get_distribution(observations)
+    with torch.random.fork_rng(), torch.no_grad():
+        torch.manual_seed(0)
+        actions = reference.sample()
+        old_log_prob = reference.log_prob(actions)
+        actor.assign(actor.vector + step)
+        samples = old_log_prob - policy.get_distribution(observations).log_prob(actions)
+    error = samples.std() / len(samples) ** 0.5
+    assert abs(trial.kl - samples.mean()) < 5.0 * error
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_restore_is_bitwise(dtype):
+    policy, actor, batch, step = attempt_of("gaussian", dtype)
+    before = {name: value.clone() for name, value in policy.state_dict().items()}
+    tester = StepTester(policy, actor, batch)
+    tester.try_step(step)
+    assert not torch.equal(policy.action_net.weight, before["action_net.weight"])
+    tester.try_step(1e30 * step)
+    tester.restore()
+    for name, value in policy.state_dict().items():
+        assert torch.equal(value, before[name])
+
+
+def test_trials_start_from_the_origin():
+    policy, actor, batch, step = attempt_of("discrete")
+    tester = StepTester(policy, actor, batch)
+    origin = actor.vector
+    first = tester.try_step(step)
+    tester.try_step(-3.0 * step)
+    assert tester.try_step(step) == first
+    assert torch.equal(actor.vector, origin + step)
+    assert tester.try_step(torch.zeros_like(step)).kl == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_steps_that_are_not_finite_are_not_taken(value):
+    policy, actor, batch, step = attempt_of("discrete")
+    tester = StepTester(policy, actor, batch)
+    origin = actor.vector
+    step[0] = value
+    assert tester.try_step(step) == Trial(math.inf, math.inf)
+    assert torch.equal(actor.vector, origin)
+
+
+@pytest.mark.parametrize("kind", ACTION_SPACES)
+def test_a_policy_that_overflows_is_not_usable(kind):
+    policy, actor, batch, step = attempt_of(kind, torch.float32)
+    tester = StepTester(policy, actor, batch)
+    assert not tester.try_step(1e38 * step.sign()).finite
+    tester.restore()
+    assert tester.try_step(0.1 * step).finite

@@ -1,0 +1,128 @@
+"""The layers of DESIGN section 6: what each module may import."""
+
+import ast
+import sys
+from pathlib import Path
+
+import pytest
+
+import sb3_crpn
+
+PACKAGE = Path(sb3_crpn.__file__).parent
+FILES = sorted(PACKAGE.rglob("*.py"))
+MAX_FUNCTION_LINES = 60
+
+# From bottom to top; a module imports from those before it alone
+LAYERS = {
+    "cubic": set(),
+    "parameters": set(),
+    "distributed": set(),
+    "vec_env": set(),
+    "episodes": set(),
+    "curvature": {"cubic", "parameters", "distributed", "episodes"},
+    "base": {"cubic", "parameters", "distributed", "vec_env", "episodes", "curvature"},
+    "crpn": {"cubic", "curvature", "base"},
+    "acrpn": {"cubic", "curvature", "base"},
+    "sosp": {"cubic", "parameters", "distributed", "curvature", "base"},
+    "theory": set(),
+    "__init__": {"crpn", "acrpn", "sosp", "theory"},
+    "zoo": {"crpn", "acrpn", "__init__"},
+}
+ARRAYS = {"numpy", "scipy", "torch"}
+SB3 = {"stable_baselines3", "gymnasium"}
+THIRD_PARTY = {
+    "cubic": ARRAYS,
+    "parameters": {"torch"},
+    "distributed": {"torch"},
+    "theory": set(),
+    "zoo": {*ARRAYS, *SB3, "rl_zoo3"},
+}
+
+
+def layer_of(path):
+    """The module that a file belongs to: its folder's name where it is in one."""
+    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+
+
+def imports(source, package):
+    """The dotted names that ``source``, of a module in ``package``, imports."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            parts = package.split(".")
+            base = parts[: len(parts) + 1 - node.level] if node.level else []
+            module = ".".join([*base, *([node.module] if node.module else [])])
+            yield from (
+                f"{module}.{alias.name}" if module == "sb3_crpn" else module for alias in node.names
+            )
+
+
+def violations(layer, names):
+    """Those of the imported ``names`` that a module of ``layer`` may not import."""
+    third_party = THIRD_PARTY.get(layer, ARRAYS | SB3)
+    for name in names:
+        root, *rest = name.split(".")
+        if root == "sb3_crpn":
+            inner = rest[0] if rest and rest[0] in LAYERS else "__init__"
+            if inner != layer and inner not in LAYERS[layer]:
+                yield name
+        elif root not in sys.stdlib_module_names and root not in third_party:
+            yield name
+
+
+def package_of(path):
+    return ".".join(path.relative_to(PACKAGE.parent).parent.parts)
+
+
+def test_every_module_has_its_layer():
+    assert {layer_of(path) for path in FILES} <= set(LAYERS)
+    names = list(LAYERS)
+    for layer, below in LAYERS.items():
+        assert below <= set(names[: names.index(layer)])
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_point_down(path):
+    names = imports(path.read_text(), package_of(path))
+    assert list(violations(layer_of(path), names)) == []
+
+
+@pytest.mark.parametrize(
+    ("layer", "source"),
+    [
+        ("cubic", "import stable_baselines3"),
+        ("cubic", "from sb3_crpn.episodes import EpisodeBatch"),
+        ("parameters", "import numpy as np"),
+        ("distributed", "from sb3_crpn.parameters import ActorParameters"),
+        ("episodes", "from sb3_crpn.curvature.scores import PairWeights"),
+        ("curvature", "from sb3_crpn import CRPN"),
+        ("curvature", "from sb3_crpn import base"),
+        ("curvature", "from ..base import PolicyNewtonAlgorithm"),
+        ("curvature", "from .. import base"),
+        ("base", "def f():\n    import sb3_crpn.crpn"),
+        ("crpn", "from sb3_crpn.acrpn import ACRPN"),
+        ("base", "import rl_zoo3"),
+        ("theory", "import torch"),
+    ],
+)
+def test_forbidden_imports_are_noticed(layer, source):
+    assert list(violations(layer, imports(source, f"sb3_crpn.{layer}")))
+
+
+def body_length(function):
+    """Lines of a function below its signature and docstring."""
+    has_docstring = ast.get_docstring(function) is not None
+    statements = function.body[has_docstring:]
+    return function.end_lineno - statements[0].lineno + 1 if statements else 0
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_functions_are_short(path):
+    functions = [
+        node
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
+    ]
+    lengths = {function.name: body_length(function) for function in functions}
+    assert {k: n for k, n in lengths.items() if n > MAX_FUNCTION_LINES} == {}
