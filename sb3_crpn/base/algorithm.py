@@ -1,14 +1,12 @@
-"""PolicyNewtonAlgorithm: what CRPN and ACRPN have in common."""
+"""PolicyNewtonAlgorithm: the arguments that CRPN and ACRPN have in common."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.policies import (
     ActorCriticCnnPolicy,
     ActorCriticPolicy,
@@ -16,46 +14,19 @@ from stable_baselines3.common.policies import (
     MultiInputActorCriticPolicy,
 )
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, explained_variance
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_crpn.base.arguments import check_arguments, check_integer
-from sb3_crpn.base.collection import EpisodeCollection
-from sb3_crpn.base.critic import fit_critic
+from sb3_crpn.base.arguments import check_arguments, check_sb3_arguments
 from sb3_crpn.base.random_state import RandomState
-from sb3_crpn.base.trial import StepTester, Trial, fit_alpha
-from sb3_crpn.cubic import CubicStep
-from sb3_crpn.curvature import (
-    CurvatureEstimate,
-    LocalModel,
-    PairWeights,
-    estimate_curvature,
-    full_model,
-    projected_model,
-)
+from sb3_crpn.base.update import PolicyNewtonUpdate
 from sb3_crpn.curvature.scores import HessianEstimator
-from sb3_crpn.episodes import DictEpisodeRolloutBuffer, EpisodeBatch, EpisodeRolloutBuffer
+from sb3_crpn.episodes import DictEpisodeRolloutBuffer, EpisodeRolloutBuffer
 from sb3_crpn.parameters import ActorParameters
 
 Self = TypeVar("Self", bound="PolicyNewtonAlgorithm")
 
-# Dimension of the Krylov space when the step's length is set by the KL divergence: the number of
-# conjugate-gradient iterations of sb3-contrib's TRPO, whose step H = 0 then reproduces.
-KRYLOV_DIM = 15
 
-
-@dataclass(frozen=True)
-class PolicyStep:
-    """What an update did to the actor: the cubic step, its α, its effect, and its acceptance."""
-
-    cubic: CubicStep
-    norm: float
-    alpha: float
-    trial: Trial
-    rejected: bool
-
-
-class PolicyNewtonAlgorithm(RandomState, EpisodeCollection):
+class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
     """Base of the cubic-regularised policy Newton algorithms.
 
     Each update minimises the cubic model of the cost J(θ) = -E[Σ_h γ^h r_h],
@@ -138,7 +109,6 @@ class PolicyNewtonAlgorithm(RandomState, EpisodeCollection):
         "CnnPolicy": ActorCriticCnnPolicy,
         "MultiInputPolicy": MultiInputActorCriticPolicy,
     }
-    actor: ActorParameters
 
     def __init__(
         self,
@@ -177,6 +147,16 @@ class PolicyNewtonAlgorithm(RandomState, EpisodeCollection):
         device: torch.device | str = "auto",
         _init_setup_model: bool = True,
     ) -> None:
+        check_sb3_arguments(
+            policy,
+            env,
+            env_required=_init_setup_model,
+            policy_kwargs=policy_kwargs,
+            rollout_buffer_kwargs=rollout_buffer_kwargs,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+        )
         super().__init__(
             policy,
             env,
@@ -247,12 +227,7 @@ class PolicyNewtonAlgorithm(RandomState, EpisodeCollection):
         return ActorParameters.reachable(self.policy, log_prob)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor", "alpha_schedule"]
-
-    @property
-    def uses_critic(self) -> bool:
-        """Whether V enters the advantages at all."""
-        return self.baseline or self.bootstrap_truncated or self.gae_lambda < 1.0
+        return [*super()._excluded_save_params(), "actor", "alpha_schedule", "_collecting"]
 
     def learn(
         self: Self,
@@ -272,166 +247,6 @@ class PolicyNewtonAlgorithm(RandomState, EpisodeCollection):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
-
-    def train(self) -> None:
-        """Update the policy from the episodes just collected (DESIGN section 5)."""
-        self.policy.set_training_mode(False)
-        self._update_learning_rate(self.policy.optimizer)
-        batch = self._episode_batch(self.rollout_buffer)
-        estimate = self._estimate(batch)
-        model = self._local_model(estimate)
-        step = self._take_step(estimate.gradient_batch, model)
-        value_loss = self._fit_critic(batch)
-        self._n_updates += 1
-        self._log_update(batch, estimate, model, step, value_loss)
-
-    def estimate_curvature(self, n_episodes: int, env: VecEnv | None = None) -> CurvatureEstimate:
-        """Estimate gradient and Hessian of J at the current policy from fresh episodes.
-
-        The estimators are those of the constructor's arguments; nothing is learnt, and the
-        episodes do not count as training.
-
-        Parameters
-        ----------
-        n_episodes
-            Number of episodes, used for the gradient and for the Hessian alike.
-        env
-            Where to simulate; ``None``: the training environment.
-        """
-        check_integer("n_episodes", n_episodes, 1)
-        batch = self._episode_batch(self._collect_fresh(n_episodes, env))
-        return estimate_curvature(self.policy, self.actor, batch, batch, self._pair_weights)
-
-    @property
-    def _pair_weights(self) -> PairWeights:
-        return PairWeights(self.hessian_estimator, self.hessian_lambda)
-
-    def _scheduled_episodes(self) -> tuple[int | None, int | None]:
-        progress = self._current_progress_remaining
-        numbers = []
-        for value in (self.n_episodes, self.n_hessian_episodes):
-            current = value(progress) if callable(value) else value
-            numbers.append(None if current is None else max(1, round(current)))
-        return numbers[0], numbers[1]
-
-    def _episode_batch(self, buffer: RolloutBuffer) -> EpisodeBatch:
-        assert isinstance(buffer, EpisodeRolloutBuffer)  # by _setup_model
-        return buffer.episode_batch(
-            baseline=self.baseline,
-            normalize_advantage=self.normalize_advantage,
-            discount_visitation=self.discount_visitation,
-        )
-
-    def _estimate(self, batch: EpisodeBatch) -> CurvatureEstimate:
-        """Estimate g from m_k and H from b_k of the episodes."""
-        m, b = self._scheduled_episodes()
-        gradient_batch = self._draw(batch, m)
-        hessian_batch = gradient_batch if b is None else self._draw(batch, b)
-        return estimate_curvature(
-            self.policy, self.actor, gradient_batch, hessian_batch, self._pair_weights
-        )
-
-    def _draw(self, batch: EpisodeBatch, n_episodes: int | None) -> EpisodeBatch:
-        """Draw episodes without replacement; all of them are the batch itself."""
-        if n_episodes is None or n_episodes >= batch.n_episodes:
-            return batch
-        return batch.take(self._rng.choice(batch.n_episodes, n_episodes, replace=False))
-
-    def _prefers_dense(self) -> bool:
-        """Whether the model is to be written out on all of ℝᵈ."""
-        return False
-
-    def _local_model(self, estimate: CurvatureEstimate) -> LocalModel:
-        """Build the cubic model, on a subspace unless the paper's full space is asked for."""
-        fisher = self.metric == "fisher"
-        shrinkage = 1.0 if self.hessian_shrinkage is None else self.hessian_shrinkage
-        unrestricted = self.krylov_dim is None and self.target_kl is None and not fisher
-        if not self._prefers_dense() and unrestricted and shrinkage != "auto":
-            return full_model(estimate, shrinkage)
-        dim = KRYLOV_DIM if self.krylov_dim is None else self.krylov_dim
-        return projected_model(
-            estimate,
-            damping=self.fisher_damping if fisher else None,
-            dim=None if self._prefers_dense() else dim,
-            shrinkage=None if shrinkage == "auto" else shrinkage,
-        )
-
-    def _solve(self, model: LocalModel, alpha: float) -> CubicStep:
-        """Minimise the cubic model: what CRPN and ACRPN differ in."""
-        raise NotImplementedError
-
-    def _take_step(self, batch: EpisodeBatch, model: LocalModel) -> PolicyStep:
-        """Choose α, move the actor, and move it back if the step is no good.
-
-        A step is rejected when the new policy is not finite, and with ``target_kl`` also when it
-        violates the target or raises the importance-weighted surrogate cost.
-        """
-        tester = StepTester(self.policy, self.actor, batch)
-
-        def attempt(alpha: float) -> tuple[CubicStep, torch.Tensor, Trial]:
-            cubic = self._solve(model, alpha)
-            step = model.lift(cubic.step)
-            return cubic, step, tester.try_step(step)
-
-        alpha = self.alpha_schedule(self._current_progress_remaining)
-        if self.target_kl is not None:
-            start = alpha if self._fitted_alpha is None else self._fitted_alpha
-            alpha = fit_alpha(lambda alpha: attempt(alpha)[2].kl, start, self.target_kl)
-        cubic, step, trial = attempt(alpha)
-        rejected = not trial.finite
-        if self.target_kl is not None and trial.finite:
-            self._fitted_alpha = alpha
-            rejected = trial.kl > self.target_kl or trial.surrogate_change > 0.0
-        if rejected:
-            tester.restore()
-        return PolicyStep(cubic, float(step.norm()), alpha, trial, rejected)
-
-    def _fit_critic(self, batch: EpisodeBatch) -> float | None:
-        """Regress V on the λ-returns; ``None`` where V is not used."""
-        if not self.uses_critic:
-            return None
-        return fit_critic(
-            self.policy,
-            self.actor,
-            batch,
-            n_epochs=self.n_critic_updates,
-            batch_size=self.batch_size,
-            rng=self._rng,
-        )
-
-    def _log_update(
-        self,
-        batch: EpisodeBatch,
-        estimate: CurvatureEstimate,
-        model: LocalModel,
-        step: PolicyStep,
-        value_loss: float | None,
-    ) -> None:
-        known = {
-            "gradient_norm": float(estimate.gradient.norm()),
-            "gradient_noise": estimate.gradient_noise,
-            "step_norm": 0.0 if step.rejected else step.norm,
-            "alpha": step.alpha,
-            "kl_divergence": 0.0 if step.rejected else step.trial.kl,
-            "surrogate_change": 0.0 if step.rejected else step.trial.surrogate_change,
-            "step_rejected": int(step.rejected),
-            "multiplier": step.cubic.multiplier,
-            "predicted_decrease": step.cubic.predicted_decrease,
-            "lambda_min": step.cubic.lambda_min if model.basis is None else model.lambda_min,
-            "hessian_vector_products": model.products or step.cubic.products,
-            "hessian_shrinkage": model.shrinkage,
-            "n_episodes": batch.n_episodes,
-            "explained_variance": explained_variance(batch.values, batch.returns),
-        }
-        for key, value in known.items():
-            self.logger.record(f"train/{key}", value)
-        if value_loss is not None:
-            self.logger.record("train/value_loss", value_loss)
-        assert isinstance(self.rollout_buffer, EpisodeRolloutBuffer)  # by _setup_model
-        self.logger.record("train/used_timesteps_fraction", self.rollout_buffer.used_fraction)
-        if hasattr(self.policy, "log_std"):
-            self.logger.record("train/std", torch.exp(self.policy.log_std).mean().item())
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
 
 def _zero_observation(space: spaces.Space[Any]) -> Any:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import inspect
+import os
 from collections.abc import Callable, Collection
 from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
+import torch
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.utils import get_device
 
 from sb3_crpn.episodes import EpisodeRolloutBuffer
 
@@ -103,10 +107,52 @@ def check_arguments(model: Any) -> None:
         "sde_sample_freq": partial(check_integer, minimum=-1),
         "rollout_buffer_class": _check_buffer_class,
         "_stats_window_size": at_least_one,
-        "seed": partial(check_optional, check=at_least_zero),
+        "seed": _check_seed,
     }
     for name, rule in rules.items():
         rule(name.lstrip("_"), getattr(model, name))
+
+
+def check_sb3_arguments(
+    policy: object, env: object, *, env_required: bool, **arguments: Any
+) -> None:
+    """Check the arguments that SB3 passes on unchecked, before it does."""
+    if not isinstance(policy, str) and not (
+        isinstance(policy, type) and issubclass(policy, ActorCriticPolicy)
+    ):
+        raise ValueError(
+            f"policy={policy!r} is not allowed, must be a name or a subclass of ActorCriticPolicy"
+        )
+    if env is None and env_required:
+        raise ValueError("env=None is not allowed, must be an environment or a registered id")
+    for name in ("policy_kwargs", "rollout_buffer_kwargs"):
+        if not isinstance(arguments[name], dict | None):
+            raise ValueError(f"{name}={arguments[name]!r} is not allowed, must be None or a dict")
+    log = arguments["tensorboard_log"]
+    if not isinstance(log, str | os.PathLike | None):
+        raise ValueError(f"tensorboard_log={log!r} is not allowed, must be None or a path")
+    verbose = arguments["verbose"]
+    if not _is_number(verbose, (int, np.integer)) or verbose not in (0, 1, 2):
+        raise ValueError(f"verbose={verbose!r} is not allowed, must be one of 0, 1, 2")
+    device = arguments["device"]
+    try:
+        if not isinstance(device, str | torch.device):
+            raise TypeError
+        get_device(device)
+    except (RuntimeError, TypeError):
+        raise ValueError(
+            f'device={device!r} is not allowed, must be "auto" or a device of PyTorch'
+        ) from None
+
+
+def _check_seed(name: str, value: object) -> None:
+    # NumPy's legacy generator, which SB3 seeds, takes 32 bits
+    if value is not None and not (
+        _is_number(value, (int, np.integer)) and 0 <= value < 2**32  # type: ignore[operator]
+    ):
+        raise ValueError(
+            f"{name}={value!r} is not allowed, must be None or an integer in [0, 2^32)"
+        )
 
 
 def _check_shrinkage(name: str, value: object) -> None:

@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import obs_as_tensor
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_crpn.episodes import EpisodeRolloutBuffer, EpisodeTracker, episodes_per_env, steps_to_quota
 from sb3_crpn.episodes.batch import IntArray
@@ -34,13 +34,20 @@ class EpisodeCollection(OnPolicyAlgorithm):
     """Collects whole episodes, a fixed quota from each environment (DESIGN section 2)."""
 
     horizon: int | None
+    baseline: bool
     bootstrap_truncated: bool
     _mean_episode_length: float | None
     _collecting: bool = False
+    _batch_sizes: tuple[int | None, int | None] = (None, None)
 
     def _scheduled_episodes(self) -> tuple[int | None, int | None]:
         """Return m_k and b_k of this update, ``None`` where they follow from ``n_steps``."""
         raise NotImplementedError
+
+    @property
+    def uses_critic(self) -> bool:
+        """Whether V enters the advantages at all."""
+        return self.baseline or self.bootstrap_truncated or self.gae_lambda < 1.0
 
     def collect_rollouts(
         self,
@@ -65,9 +72,10 @@ class EpisodeCollection(OnPolicyAlgorithm):
             A reward or an observation is not finite, or no episode comes to an end.
         """
         assert isinstance(rollout_buffer, EpisodeRolloutBuffer)  # set by _setup_model
-        given = [number for number in self._scheduled_episodes() if number is not None]
+        self._batch_sizes = self._scheduled_episodes()
+        given = [number for number in self._batch_sizes if number is not None]
         quota = steps_to_quota(n_rollout_steps, self._mean_episode_length)
-        if len(given) < 1 or self._scheduled_episodes()[0] is None:
+        if self._batch_sizes[0] is None:
             given.append(quota * env.num_envs)
         quotas = episodes_per_env(max(given), env.num_envs)
         if not self._collect_episodes(env, callback, rollout_buffer, quotas):
@@ -113,6 +121,7 @@ class EpisodeCollection(OnPolicyAlgorithm):
         can_reset = _early_resets_allowed(env)
         if can_reset and not np.all(self._last_episode_starts):
             self._reset_environments(env)
+        _require_finite("observation", self._last_obs, self.num_timesteps)
         tracker = EpisodeTracker(quotas, np.array(self._last_episode_starts, bool), self.horizon)
         rollout_buffer.reset()
         n_steps = last_end = 0
@@ -142,6 +151,7 @@ class EpisodeCollection(OnPolicyAlgorithm):
             if tracker.stalled and can_reset:
                 self._reset_environments(env)
                 tracker.restart()
+                _require_finite("observation", self._last_obs, self.num_timesteps)
             _require_progress(n_steps - last_end)
         callback.update_locals(locals())
         return True
@@ -158,9 +168,13 @@ class EpisodeCollection(OnPolicyAlgorithm):
             raise ValueError("env=None is not allowed for a model without an environment")
         buffer = self._new_buffer(target.num_envs)
         state = {name: getattr(self, name) for name in _COUNTERS}
+        normalizer = unwrap_vec_normalize(target)
+        normalizes = normalizer is not None and normalizer.training
         place = (self._last_obs, self._last_episode_starts)
         self.ep_info_buffer, self.ep_success_buffer = deque(maxlen=1), deque(maxlen=1)
         try:
+            if normalizer is not None:
+                normalizer.training = False
             if env is not None or self._last_obs is None:
                 self._reset_environments(target)
             callback = CallbackList([])
@@ -169,6 +183,8 @@ class EpisodeCollection(OnPolicyAlgorithm):
             self._collect_episodes(target, callback, buffer, quotas)
         finally:
             self.__dict__.update(state)
+            if normalizer is not None:
+                normalizer.training = normalizes
             if env is not None:
                 self._last_obs, self._last_episode_starts = place
         return buffer
@@ -192,6 +208,8 @@ class EpisodeCollection(OnPolicyAlgorithm):
         """Sample actions; return them raw and as the environment takes them, with V and log π."""
         with torch.no_grad():
             sampled, values, log_probs = self.policy(obs_as_tensor(obs, self.device))
+        if not self.uses_critic:
+            values = torch.zeros_like(values)  # lest it leaves its rounding in the returns
         actions = sampled.cpu().numpy()
         if not isinstance(self.action_space, spaces.Box):
             return actions, actions, values, log_probs

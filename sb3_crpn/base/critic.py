@@ -51,7 +51,10 @@ def fit_critic(
     """
     if not np.isfinite(batch.returns).all():
         return float("inf")
-    policy.set_training_mode(True)
+    if not n_epochs:
+        return float("nan")
+    # not in training mode: a normalisation layer's statistics may be the actor's too
+    policy.set_training_mode(False)
     layer = _output_layer(policy, actor)
     shift, scale = (0.0, 1.0) if layer is None else _units(batch.returns)
     returns = torch.as_tensor(
@@ -72,7 +75,7 @@ def fit_critic(
                 for parameter in actor.tensors:
                     parameter.grad = None  # the optimiser passes over it
                 policy.optimizer.step()
-    return float(np.mean(losses)) * scale**2 if losses else float("nan")
+    return float(np.mean(losses)) * scale**2
 
 
 def _at(observations: Observations, steps: torch.Tensor) -> Observations:

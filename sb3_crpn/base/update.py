@@ -1,0 +1,203 @@
+"""One update: estimate, solve, accept, fit the critic, log."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import torch
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import explained_variance
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_crpn.base.arguments import check_integer, check_real
+from sb3_crpn.base.collection import EpisodeCollection
+from sb3_crpn.base.critic import fit_critic
+from sb3_crpn.base.step import PolicyStep, take_step
+from sb3_crpn.base.trial import StepTester
+from sb3_crpn.cubic import CubicStep
+from sb3_crpn.curvature import (
+    CurvatureEstimate,
+    LocalModel,
+    PairWeights,
+    estimate_curvature,
+    full_model,
+    projected_model,
+)
+from sb3_crpn.curvature.scores import HessianEstimator
+from sb3_crpn.episodes import EpisodeBatch, EpisodeRolloutBuffer
+from sb3_crpn.parameters import ActorParameters
+
+# Dimension of the Krylov space when the step's length is set by the KL divergence: the number of
+# conjugate-gradient iterations of sb3-contrib's TRPO, whose step H = 0 then reproduces.
+KRYLOV_DIM = 15
+
+
+class PolicyNewtonUpdate(EpisodeCollection):
+    """The update of DESIGN section 5; the subclass brings the arguments and the solver."""
+
+    actor: ActorParameters
+    n_episodes: int | Schedule | None
+    n_hessian_episodes: int | Schedule | None
+    alpha_schedule: Schedule
+    target_kl: float | None
+    metric: Literal["euclidean", "fisher"]
+    fisher_damping: float
+    hessian_estimator: HessianEstimator
+    hessian_lambda: float
+    hessian_shrinkage: float | Literal["auto"] | None
+    krylov_dim: int | None
+    normalize_advantage: bool
+    discount_visitation: bool
+    batch_size: int
+    n_critic_updates: int
+    _rng: np.random.Generator
+    _fitted_alpha: float | None
+
+    def train(self) -> None:
+        """Update the policy from the episodes just collected (DESIGN section 5)."""
+        self.policy.set_training_mode(False)
+        self._update_learning_rate(self.policy.optimizer)
+        batch = self._episode_batch(self.rollout_buffer)
+        estimate = self._estimate(batch)
+        model = self._local_model(estimate)
+        step = self._take_step(estimate.gradient_batch, model)
+        value_loss = self._fit_critic(batch)
+        self._n_updates += 1
+        self._log_update(batch, estimate, model, step, value_loss)
+
+    def estimate_curvature(self, n_episodes: int, env: VecEnv | None = None) -> CurvatureEstimate:
+        """Estimate gradient and Hessian of J at the current policy from fresh episodes.
+
+        The estimators are those of the constructor's arguments; nothing is learnt, and the
+        episodes do not count as training.
+
+        Parameters
+        ----------
+        n_episodes
+            Number of episodes, used for the gradient and for the Hessian alike.
+        env
+            Where to simulate; ``None``: the training environment.
+        """
+        check_integer("n_episodes", n_episodes, 1)
+        batch = self._episode_batch(self._collect_fresh(n_episodes, env))
+        return estimate_curvature(self.policy, self.actor, batch, batch, self._pair_weights)
+
+    @property
+    def _pair_weights(self) -> PairWeights:
+        return PairWeights(self.hessian_estimator, self.hessian_lambda)
+
+    def _scheduled_episodes(self) -> tuple[int | None, int | None]:
+        progress = self._current_progress_remaining
+        numbers: list[int | None] = []
+        for name in ("n_episodes", "n_hessian_episodes"):
+            value = getattr(self, name)
+            if callable(value):
+                value = value(progress)
+                check_real(f"{name}({progress:g})", value, 1.0)
+            numbers.append(None if value is None else round(value))
+        return numbers[0], numbers[1]
+
+    def _episode_batch(self, buffer: RolloutBuffer) -> EpisodeBatch:
+        assert isinstance(buffer, EpisodeRolloutBuffer)  # by _setup_model
+        return buffer.episode_batch(
+            baseline=self.baseline,
+            normalize_advantage=self.normalize_advantage,
+            discount_visitation=self.discount_visitation,
+        )
+
+    def _estimate(self, batch: EpisodeBatch) -> CurvatureEstimate:
+        """Estimate g from m_k and H from b_k of the episodes."""
+        m, b = self._batch_sizes  # of the progress at which they were simulated
+        gradient_batch = self._draw(batch, m)
+        hessian_batch = gradient_batch if b is None else self._draw(batch, b)
+        return estimate_curvature(
+            self.policy, self.actor, gradient_batch, hessian_batch, self._pair_weights
+        )
+
+    def _draw(self, batch: EpisodeBatch, n_episodes: int | None) -> EpisodeBatch:
+        """Draw episodes without replacement; all of them are the batch itself."""
+        if n_episodes is None or n_episodes >= batch.n_episodes:
+            return batch
+        return batch.take(self._rng.choice(batch.n_episodes, n_episodes, replace=False))
+
+    def _prefers_dense(self) -> bool:
+        """Whether the model is to be written out on all of ℝᵈ."""
+        return False
+
+    def _local_model(self, estimate: CurvatureEstimate) -> LocalModel:
+        """Build the cubic model, on a subspace unless the paper's full space is asked for."""
+        fisher = self.metric == "fisher"
+        shrinkage = 1.0 if self.hessian_shrinkage is None else self.hessian_shrinkage
+        unrestricted = self.krylov_dim is None and self.target_kl is None and not fisher
+        if not self._prefers_dense() and unrestricted and shrinkage != "auto":
+            return full_model(estimate, shrinkage)
+        dim = KRYLOV_DIM if self.krylov_dim is None else self.krylov_dim
+        return projected_model(
+            estimate,
+            damping=self.fisher_damping if fisher else None,
+            dim=None if self._prefers_dense() else dim,
+            shrinkage=None if shrinkage == "auto" else shrinkage,
+        )
+
+    def _solve(self, model: LocalModel, alpha: float) -> CubicStep:
+        """Minimise the cubic model: what CRPN and ACRPN differ in."""
+        raise NotImplementedError
+
+    def _take_step(self, batch: EpisodeBatch, model: LocalModel) -> PolicyStep:
+        """Choose α, move the actor, and move it back if the step is no good."""
+        alpha = self.alpha_schedule(self._current_progress_remaining)
+        if self.target_kl is not None and self._fitted_alpha is not None:
+            alpha = self._fitted_alpha
+        step = take_step(
+            StepTester(self.policy, self.actor, batch),
+            model,
+            lambda alpha: self._solve(model, alpha),
+            alpha,
+            self.target_kl,
+        )
+        if self.target_kl is not None and step.trial.finite:
+            self._fitted_alpha = step.alpha
+        return step
+
+    def _fit_critic(self, batch: EpisodeBatch) -> float | None:
+        """Regress V on the λ-returns; ``None`` where V is not used."""
+        if not self.uses_critic:
+            return None
+        return fit_critic(
+            self.policy,
+            self.actor,
+            batch,
+            n_epochs=self.n_critic_updates,
+            batch_size=self.batch_size,
+            rng=self._rng,
+        )
+
+    def _log_update(
+        self,
+        batch: EpisodeBatch,
+        estimate: CurvatureEstimate,
+        model: LocalModel,
+        step: PolicyStep,
+        value_loss: float | None,
+    ) -> None:
+        assert isinstance(self.rollout_buffer, EpisodeRolloutBuffer)  # by _setup_model
+        values = {
+            "gradient_norm": float(estimate.gradient.norm()),
+            "gradient_noise": estimate.gradient_noise,
+            **step.log(),
+            "lambda_min": step.cubic.lambda_min if model.basis is None else model.lambda_min,
+            "hessian_vector_products": model.products or step.cubic.products,
+            "hessian_shrinkage": model.shrinkage,
+            "n_episodes": batch.n_episodes,
+            "used_timesteps_fraction": self.rollout_buffer.used_fraction,
+            "explained_variance": explained_variance(batch.values, batch.returns),
+        }
+        if value_loss is not None:
+            values["value_loss"] = value_loss
+        if hasattr(self.policy, "log_std"):
+            values["std"] = torch.exp(self.policy.log_std).mean().item()
+        for key, value in values.items():
+            self.logger.record(f"train/{key}", value)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
