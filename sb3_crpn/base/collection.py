@@ -107,7 +107,8 @@ class EpisodeCollection(OnPolicyAlgorithm):
             if not completed:
                 # where the environments stand is unknown: the next rollout resets them
                 self._last_episode_starts = np.zeros(env.num_envs, dtype=bool)
-        rollout_buffer.compute_advantages()
+        if completed:
+            rollout_buffer.compute_advantages()
         return completed
 
     def _run_environments(
