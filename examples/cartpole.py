@@ -6,6 +6,7 @@ from datetime import datetime
 from pathlib import Path
 
 import matplotlib
+import torch
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.results_plotter import X_TIMESTEPS, plot_results
@@ -17,6 +18,7 @@ TIMESTEPS = 60_000
 
 def main() -> None:
     """Run the whole example."""
+    torch.set_num_threads(1)  # on so small a network threads cost more than they bring
     run = Path("runs") / f"CartPole-v1_{datetime.now():%Y%m%d-%H%M%S}"
     env = make_vec_env("CartPole-v1", n_envs=4, seed=0, monitor_dir=str(run / "monitor"))
     model = CRPN("MlpPolicy", env, n_steps=256, seed=0, device="cpu")
