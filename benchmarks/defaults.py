@@ -5,7 +5,7 @@
 
 Runs every missing (algorithm, setting, environment, seed) in parallel processes, appends a row
 each to ``benchmarks/defaults.csv`` as it ends, and prints the table. The peer is sb3-contrib's
-TRPO with the hyperparameters of rl-zoo.
+TRPO with the hyperparameters of rl-zoo, which needs the ``zoo`` extra.
 """
 
 from __future__ import annotations
