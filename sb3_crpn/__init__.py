@@ -1,7 +1,7 @@
 """Cubic-regularised policy Newton algorithms for Stable-Baselines3.
 
 ``CRPN`` and ``ACRPN`` are Stable-Baselines3 algorithms; ``PAPER`` holds the settings at which they
-are Algorithms 1 and 2 of Maniyar et al., AISTATS 2024.
+are Algorithms 1 and 2 of Maniyar et al., AISTATS 2024 (the latter with ``subsolver_steps=None``).
 """
 
 from sb3_crpn.acrpn import ACRPN

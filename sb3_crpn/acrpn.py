@@ -37,8 +37,8 @@ class ACRPN(PolicyNewtonAlgorithm):
     sosp_epsilon
         ε > 0 of second-order stationarity.
     subsolver_steps
-        N̂, at most so many iterations of an inner gradient descent; ``None``: ℓ/√(ρε) times a
-        logarithm, as the theory has it.
+        N̂, at most so many iterations of either inner gradient descent; ``None``: ℓ/√(ρε) times a
+        logarithm, as the theory has it, up to 10,000. The paper's algorithm needs ``None``.
     stop_at_sosp
         End training when the predicted decrease says ε-SOSP, as the paper's Algorithm 2 does.
     **arguments
