@@ -1,0 +1,15 @@
+"""Small decision processes whose J(θ), ∇J(θ) and ∇²J(θ) are known exactly, to be simulated too."""
+
+from benchmarks.exact.env import TabularEnv, TabularVectorEnv
+from benchmarks.exact.mdp import TabularMDP, coordination_mdp, random_mdp
+from benchmarks.exact.policy import actor_vector, assign_actor
+
+__all__ = [
+    "TabularEnv",
+    "TabularMDP",
+    "TabularVectorEnv",
+    "actor_vector",
+    "assign_actor",
+    "coordination_mdp",
+    "random_mdp",
+]
