@@ -1,0 +1,97 @@
+"""Train algorithms × environments × seeds in parallel processes; resume where it stopped.
+
+    python -m benchmarks.learning --algos CRPN TRPO --envs CartPole-v1 Pendulum-v1 --seeds 10
+    python -m benchmarks.learning --algos CRPN --defaults --set "" gamma=1 n_steps=1024,gamma=1
+
+A run that the results hold already is not repeated. Seeds come outermost and algorithms innermost,
+so that what is there so far is balanced. ``Random`` measures the random policy.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pandas as pd
+
+from benchmarks.learning import store
+from benchmarks.learning.pool import run_all
+from benchmarks.learning.run import Run
+from benchmarks.learning.settings import (
+    ALGORITHMS,
+    BUDGETS,
+    RANDOM,
+    describe,
+    parse_setting,
+    resolve,
+    same_hyperparameters,
+)
+
+
+def main() -> None:
+    """Run what is missing."""
+    args = _parse_arguments()
+    done = store.read_runs(args.results)
+    wanted = list(_wanted_runs(args))
+    missing = [run for run in wanted if not _is_done(run, done)]
+    print(f"{len(wanted) - len(missing)} of {len(wanted)} runs are done: {args.results}")
+    if missing and run_all(missing, args.jobs, args.results):
+        sys.exit(1)
+
+
+def _parse_arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.learning",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    names = [*ALGORITHMS, RANDOM]
+    parser.add_argument("--algos", nargs="+", default=names, choices=names, metavar="ALGO",
+                        help=f"default: all of {' '.join(names)}")  # fmt: skip
+    parser.add_argument("--envs", nargs="+", default=list(BUDGETS), metavar="ENV",
+                        help=f"default: {' '.join(BUDGETS)}")  # fmt: skip
+    parser.add_argument("--seeds", type=int, default=3, help="seeds 0, …, SEEDS - 1")
+    parser.add_argument("--first-seed", type=int, default=0, help="start from this one instead")
+    parser.add_argument("--set", nargs="+", default=[""], metavar="KEY=VALUE,...",
+                        dest="settings", help='override hyperparameters; "" for none')  # fmt: skip
+    parser.add_argument("--defaults", action="store_true",
+                        help="constructor's defaults in place of the YAML entries")  # fmt: skip
+    parser.add_argument("--timesteps", type=int, help="default: the benchmark's budget")
+    parser.add_argument("--jobs", type=int, default=2, help="parallel processes")
+    parser.add_argument("--results", type=Path, default=store.RESULTS, help="folder of the CSVs")
+    args = parser.parse_args()
+    unknown = [env for env in args.envs if env not in BUDGETS]
+    if unknown and args.timesteps is None:
+        parser.error(f"no budget for {' '.join(unknown)}: give --timesteps")
+    return args
+
+
+def _wanted_runs(args: argparse.Namespace) -> Iterator[Run]:
+    seeds = range(args.first_seed, args.first_seed + args.seeds)
+    for seed, env, setting, algo in itertools.product(seeds, args.envs, args.settings, args.algos):
+        overrides = parse_setting(setting)
+        entry, arguments = resolve(algo, env, overrides, defaults=args.defaults)
+        label = [f"{key}={value}" for key, value in sorted(overrides.items())]
+        yield Run(
+            algo=algo,
+            env=env,
+            setting=",".join(["defaults", *label] if args.defaults else label),
+            timesteps=args.timesteps or BUDGETS[env],
+            seed=seed,
+            hyperparameters=describe(algo, arguments),
+            entry=entry,
+            arguments=arguments,
+        )
+
+
+def _is_done(run: Run, done: pd.DataFrame) -> bool:
+    keys = [getattr(run, name) for name in store.KEYS]
+    rows = done[(done[list(store.KEYS)] == keys).all(axis=1)]
+    return any(same_hyperparameters(run.hyperparameters, row) for row in rows["hyperparameters"])
+
+
+if __name__ == "__main__":
+    main()

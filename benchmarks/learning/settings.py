@@ -1,0 +1,271 @@
+"""Which hyperparameters an algorithm runs with on an environment, and for how many steps.
+
+Peers run with those that rl-zoo publishes for the environment; where it has none, with the nearest
+entry: another version of the same task, else the one named in ``NEAREST``. CRPN and ACRPN run with
+the repository's ``zoo_configs``, which fall back to the constructor's defaults.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from sb3_crpn import PAPER, zoo
+
+_CLASSIC = (
+    "CartPole-v1",
+    "Acrobot-v1",
+    "MountainCar-v0",
+    "MountainCarContinuous-v0",
+    "Pendulum-v1",
+)
+_BOX2D = ("LunarLander-v3", "LunarLanderContinuous-v3")
+_MUJOCO = (
+    "Reacher-v5",
+    "InvertedPendulum-v5",
+    "InvertedDoublePendulum-v5",
+    "Swimmer-v5",
+    "Hopper-v5",
+    "HalfCheetah-v5",
+)
+# Environment steps of a run
+BUDGETS: dict[str, int] = {
+    **dict.fromkeys(_CLASSIC, 100_000),
+    **dict.fromkeys(_BOX2D, 200_000),
+    **dict.fromkeys(_MUJOCO, 300_000),
+    "FetchReachDense-v4": 100_000,
+}
+
+# The entry for tasks that a file of hyperparameters lacks in every version. rl-zoo's Hopper-v4 is
+# its MuJoCo default for A2C and TRPO, and Ant-v4 is for PPO; the Bullet entries for the pendulums
+# are marked "To be tuned", the one for Reacher "Tuned". The paper's entries follow the actions.
+NEAREST: dict[str, dict[str, str]] = {
+    "a2c.yml": {
+        "InvertedPendulum-v5": "Hopper-v4",
+        "InvertedDoublePendulum-v5": "Hopper-v4",
+        "Reacher-v5": "ReacherBulletEnv-v0",
+        "FetchReachDense-v4": "Hopper-v4",
+    },
+    "ppo.yml": {"FetchReachDense-v4": "Ant-v4"},
+    "trpo.yml": {
+        "InvertedPendulum-v5": "Hopper-v4",
+        "InvertedDoublePendulum-v5": "Hopper-v4",
+        "Reacher-v5": "ReacherBulletEnv-v0",
+        "FetchReachDense-v4": "Hopper-v4",
+    },
+    **dict.fromkeys(
+        ("crpn_paper.yml", "acrpn_paper.yml"),
+        dict.fromkeys(("Acrobot-v1", "MountainCar-v0", "LunarLander-v3"), "CartPole-v1")
+        | dict.fromkeys(
+            (
+                "MountainCarContinuous-v0",
+                "Pendulum-v1",
+                "LunarLanderContinuous-v3",
+                *_MUJOCO[1:],
+                "FetchReachDense-v4",
+            ),
+            "Reacher-v5",
+        ),
+    ),
+}
+
+# Settings of a run that are no constructor arguments, with rl-zoo's defaults
+_OF_ENVIRONMENT = {"n_envs": 1, "normalize": False}
+# Arguments that cannot change what is learnt, or that every run sets itself
+_NOT_RECORDED = {
+    "env", "n_timesteps", "seed", "device", "verbose", "tensorboard_log", "stats_window_size",
+    "rollout_buffer_class", "rollout_buffer_kwargs", "_init_setup_model",
+}  # fmt: skip
+# CRPN's arguments that a gradient step has no use for
+_NOT_REINFORCE = {
+    "alpha", "target_kl", "metric", "fisher_damping", "hessian_estimator", "hessian_lambda",
+    "hessian_shrinkage", "krylov_dim", "n_hessian_episodes",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """A learner of the benchmark.
+
+    Attributes
+    ----------
+    zoo_name
+        Its key in rl-zoo's table of algorithms.
+    config
+        File name of its hyperparameters: in ``zoo_configs`` or, for peers, in rl_zoo3.
+    is_peer
+        Whether the hyperparameters are rl-zoo's.
+    is_paper
+        Whether it is the paper's algorithm: without an entry, ``PAPER``.
+    """
+
+    zoo_name: str
+    config: str
+    is_peer: bool = False
+    is_paper: bool = False
+
+    @property
+    def config_path(self) -> Path:
+        """Where the hyperparameters are."""
+        if self.is_peer:
+            return _zoo_package() / "hyperparams" / self.config
+        return zoo.config_file(self.config.removesuffix(".yml"))
+
+
+ALGORITHMS: dict[str, Algorithm] = {
+    "CRPN": Algorithm("crpn", "crpn.yml"),
+    "ACRPN": Algorithm("acrpn", "acrpn.yml"),
+    "CRPN-paper": Algorithm("crpn", "crpn_paper.yml", is_paper=True),
+    "ACRPN-paper": Algorithm("acrpn", "acrpn_paper.yml", is_paper=True),
+    "REINFORCE": Algorithm("reinforce", "crpn.yml"),
+    "A2C": Algorithm("a2c", "a2c.yml", is_peer=True),
+    "PPO": Algorithm("ppo", "ppo.yml", is_peer=True),
+    "TRPO": Algorithm("trpo", "trpo.yml", is_peer=True),
+}
+# Uniformly random actions: the zero of normalised scores
+RANDOM = "Random"
+
+
+def register_algorithms() -> dict[str, Any]:
+    """Return rl-zoo's table of algorithms with this repository's added, by zoo name."""
+    from rl_zoo3 import ALGOS
+
+    from benchmarks.reinforce import REINFORCE
+
+    zoo.register()
+    ALGOS.update(reinforce=REINFORCE)
+    return ALGOS
+
+
+def resolve(
+    algo: str, env_id: str, overrides: Mapping[str, Any], *, defaults: bool = False
+) -> tuple[str, dict[str, Any]]:
+    """Return the entry's name and the hyperparameters in rl-zoo's format.
+
+    Parameters
+    ----------
+    algo
+        A key of ``ALGORITHMS``, or ``RANDOM``.
+    env_id
+        Registered id.
+    overrides
+        Hyperparameters in place of the entry's.
+    defaults
+        Take the constructor's defaults in place of the entry.
+    """
+    if algo == RANDOM:
+        return "-", {}
+    algorithm = ALGORITHMS[algo]
+    entries = {} if defaults else _load(algorithm.config_path)
+    found = find_entry(entries, env_id, NEAREST.get(algorithm.config, {}))
+    if found is not None:
+        name, entry = f"{algorithm.config}: {found}", entries[found]
+    else:
+        name, entry = "defaults", {"policy": "MlpPolicy", **(PAPER if algorithm.is_paper else {})}
+    if algo == "REINFORCE":
+        entry = {key: value for key, value in entry.items() if key not in _NOT_REINFORCE}
+    return name, {**entry, **overrides}
+
+
+def find_entry(entries: Mapping[str, Any], env_id: str, nearest: Mapping[str, str]) -> str | None:
+    """Return the entry's key: exact, the task's newest version, the nearest, "default" or none."""
+    if env_id in entries:
+        return env_id
+    task = re.sub(r"-v\d+$", "", env_id)
+    versions = [key for key in entries if re.fullmatch(rf"{re.escape(task)}-v\d+", key)]
+    if versions:
+        return max(versions, key=lambda key: int(key.rsplit("-v", 1)[1]))
+    name = nearest.get(env_id, "default")
+    return name if name in entries else None
+
+
+def parse_setting(setting: str) -> dict[str, Any]:
+    """Return ``"n_steps=1024,metric=euclidean"`` as a dict.
+
+    Values that are no Python literals stay text, which rl-zoo then reads:
+    ``learning_rate=lin_1e-3`` or ``policy_kwargs=dict(net_arch=[])``.
+
+    Raises
+    ------
+    ValueError
+        The text is not a list of ``key=value``.
+    """
+    source = f"dict({setting})"
+    try:
+        call = ast.parse(source, mode="eval").body
+    except SyntaxError as error:
+        raise ValueError(f"setting={setting!r} is not allowed, must be key=value,...") from error
+    assert isinstance(call, ast.Call)  # by the parentheses
+    if call.args or any(keyword.arg is None for keyword in call.keywords):
+        raise ValueError(f"setting={setting!r} is not allowed, must be key=value,...")
+    parsed = {}
+    for keyword in call.keywords:
+        text = ast.get_source_segment(source, keyword.value)
+        try:
+            parsed[keyword.arg] = ast.literal_eval(keyword.value)
+        except ValueError:
+            parsed[keyword.arg] = text
+    return parsed
+
+
+def describe(algo: str, hyperparameters: Mapping[str, Any]) -> str:
+    """Return ``"key=value; ..."`` of all hyperparameters, the constructor's defaults included.
+
+    It is what tells two runs apart: a row of other hyperparameters is not this run's.
+    """
+    if algo == RANDOM:
+        return ""
+    known = {**_OF_ENVIRONMENT, **_signature(ALGORITHMS[algo].zoo_name), **hyperparameters}
+    unused = _NOT_RECORDED | (_NOT_REINFORCE if algo == "REINFORCE" else set())
+    known = {key: value for key, value in known.items() if key not in unused}
+    return "; ".join(f"{key}={_compact(known[key])}" for key in sorted(known))
+
+
+def same_hyperparameters(first: str, second: str) -> bool:
+    """Return whether two descriptions agree on every key that both have.
+
+    An argument that the constructor gained in between does not make a run another one.
+    """
+    one, other = _read(first), _read(second)
+    return all(one[key] == other[key] for key in one.keys() & other.keys())
+
+
+def _read(description: str) -> dict[str, str]:
+    parts = (part.partition("=") for part in description.split("; ") if part)
+    return {key: value for key, _, value in parts}
+
+
+def _compact(value: object) -> str:
+    return re.sub(r"\s+", " ", str(value))
+
+
+@cache
+def _signature(zoo_name: str) -> dict[str, Any]:
+    """Return the constructor's arguments that have a default."""
+    arguments = inspect.signature(register_algorithms()[zoo_name]).parameters.values()
+    return {a.name: a.default for a in arguments if a.default is not a.empty}
+
+
+@cache
+def _zoo_package() -> Path:
+    spec = find_spec("rl_zoo3")
+    if spec is None or spec.origin is None:
+        raise ModuleNotFoundError("the benchmark needs rl_zoo3: pip install sb3-crpn[zoo]")
+    return Path(spec.origin).parent
+
+
+@cache
+def _load(path: Path) -> dict[str, dict[str, Any]]:
+    import yaml
+
+    if not path.exists():
+        return {}
+    entries: dict[str, dict[str, Any]] = yaml.safe_load(path.read_text())
+    return entries

@@ -1,0 +1,81 @@
+"""The two tidy CSV files of a results folder: one row per run, one row per point of a curve."""
+
+from __future__ import annotations
+
+import csv
+import fcntl
+import io
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, TextIO
+
+import pandas as pd
+
+from benchmarks.learning.run import Result, Run
+
+RESULTS = Path(__file__).parent / "results"
+
+KEYS = ("algo", "env", "setting", "timesteps", "seed")
+RUN_COLUMNS = (
+    *KEYS,
+    "mean_return",
+    "final_return",
+    "episodes",
+    "wall_seconds",
+    "cpu_seconds",
+    "entry",
+    "hyperparameters",
+    "versions",
+)
+CURVE_COLUMNS = (*KEYS, "steps", "return")
+
+
+def append(folder: Path, run: Run, result: Result) -> None:
+    """Store a finished run: its curve, then the row that makes it count as done."""
+    folder.mkdir(parents=True, exist_ok=True)
+    key = [getattr(run, name) for name in KEYS]
+    points = ([*key, steps, _short(value)] for steps, value in result.curve)
+    _append_rows(folder / "curves.csv", CURVE_COLUMNS, points)
+    row = {**dict(zip(KEYS, key, strict=True)), **result.row}
+    row.update(entry=run.entry, hyperparameters=run.hyperparameters)
+    _append_rows(folder / "runs.csv", RUN_COLUMNS, [[_short(row[name]) for name in RUN_COLUMNS]])
+
+
+def read_runs(folder: Path) -> pd.DataFrame:
+    """Return the rows of all runs, the latest where one was repeated."""
+    return _read(folder / "runs.csv", RUN_COLUMNS, list(KEYS))
+
+
+def read_curves(folder: Path) -> pd.DataFrame:
+    """Return the points of all curves, of the latest run where one was repeated."""
+    return _read(folder / "curves.csv", CURVE_COLUMNS, [*KEYS, "steps"])
+
+
+def _read(path: Path, columns: Sequence[str], keys: list[str]) -> pd.DataFrame:
+    if not path.exists():
+        return pd.DataFrame(columns=list(columns))
+    text = ("setting", "entry", "hyperparameters")
+    frame = pd.read_csv(path, converters=dict.fromkeys(set(text) & set(columns), str))
+    return frame.drop_duplicates(keys, keep="last", ignore_index=True)
+
+
+def _append_rows(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Append all rows in one write, so that a run that is stopped leaves none or all of them."""
+    with path.open("a", newline="") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # until it is closed
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        if _is_empty(file):
+            writer.writerow(columns)
+        writer.writerows(rows)
+        file.write(text.getvalue())
+
+
+def _is_empty(file: TextIO) -> bool:
+    file.seek(0, io.SEEK_END)
+    return file.tell() == 0
+
+
+def _short(value: Any) -> Any:
+    """Return floats with seven significant digits, which is more than they are good for."""
+    return f"{value:.7g}" if isinstance(value, float) else value
