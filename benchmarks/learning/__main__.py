@@ -35,7 +35,7 @@ def main() -> None:
     """Run what is missing."""
     args = _parse_arguments()
     done = store.read_runs(args.results)
-    wanted = list(_wanted_runs(args))
+    wanted = list(dict.fromkeys(_wanted_runs(args)))
     missing = [run for run in wanted if not _is_done(run, done)]
     print(f"{len(wanted) - len(missing)} of {len(wanted)} runs are done: {args.results}")
     if missing and run_all(missing, args.jobs, args.results):
@@ -75,10 +75,12 @@ def _wanted_runs(args: argparse.Namespace) -> Iterator[Run]:
         overrides = parse_setting(setting)
         entry, arguments = resolve(algo, env, overrides, defaults=args.defaults)
         label = [f"{key}={value}" for key, value in sorted(overrides.items())]
+        if args.defaults:
+            label.insert(0, "defaults")
         yield Run(
             algo=algo,
             env=env,
-            setting=",".join(["defaults", *label] if args.defaults else label),
+            setting="" if algo == RANDOM else ",".join(label),
             timesteps=args.timesteps or BUDGETS[env],
             seed=seed,
             hyperparameters=describe(algo, arguments),

@@ -265,7 +265,5 @@ def _zoo_package() -> Path:
 def _load(path: Path) -> dict[str, dict[str, Any]]:
     import yaml
 
-    if not path.exists():
-        return {}
     entries: dict[str, dict[str, Any]] = yaml.safe_load(path.read_text())
     return entries

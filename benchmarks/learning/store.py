@@ -54,8 +54,8 @@ def read_curves(folder: Path) -> pd.DataFrame:
 def _read(path: Path, columns: Sequence[str], keys: list[str]) -> pd.DataFrame:
     if not path.exists():
         return pd.DataFrame(columns=list(columns))
-    text = ("setting", "entry", "hyperparameters")
-    frame = pd.read_csv(path, converters=dict.fromkeys(set(text) & set(columns), str))
+    # a setting, or the random policy's hyperparameters, may be the empty text
+    frame = pd.read_csv(path, keep_default_na=False, na_values=["nan"])
     return frame.drop_duplicates(keys, keep="last", ignore_index=True)
 
 

@@ -1,0 +1,156 @@
+"""Markdown tables of a comparison."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmarks.learning.comparison import METRICS, Comparison
+from benchmarks.learning.settings import RANDOM
+from benchmarks.learning.statistics import (
+    Array,
+    Estimate,
+    bootstrap,
+    improvement,
+    interquartile_mean,
+    stratified_bootstrap,
+)
+
+
+def report(comparison: Comparison) -> str:
+    """Return all tables."""
+    parts = [
+        "# Learning compared",
+        "Returns are raw returns of whole episodes. Mean return over training: every environment "
+        "step counts the return of its episode; final return: the deterministic policy, 20 "
+        "episodes. Means over seeds, with 95 % bootstrap intervals.",
+    ]
+    if comparison.n_outdated:
+        parts.append(f"{comparison.n_outdated} runs with outdated hyperparameters are left out.")
+    parts += ["## Aggregate", aggregate_table(comparison)]
+    parts += ["## Each environment", task_table(comparison)]
+    parts += ["## Cost", cost_table(comparison)]
+    parts += ["## Hyperparameters", entry_table(comparison)]
+    return "\n\n".join(parts) + "\n"
+
+
+def aggregate_table(comparison: Comparison) -> str:
+    """Return interquartile means of normalised scores and probabilities of improvement."""
+    baseline = comparison.baseline
+    labels = [label for label in comparison.labels if label != RANDOM]
+    notes, columns = [], []
+    for metric, name in METRICS.items():
+        tasks = comparison.comparable_tasks(labels, metric)
+        notes.append(f"{name}: {', '.join(tasks) or 'none'}")
+        if not tasks:
+            continue
+        scores = comparison.scores(labels, tasks, metric)
+        means = [stratified_bootstrap(scores[label], interquartile_mean) for label in labels]
+        columns.append([f"IQM, {name}", *map(_cell, means)])
+        better = [improvement(scores[label], scores[baseline]) for label in labels]
+        columns.append([f"P(better than {baseline}), {name}", *map(_cell, better)])
+    rows = zip(["algorithm", *labels], *columns, strict=True)
+    text = (
+        f"Scores are (return - random) / ({baseline} - random): the random policy is 0, "
+        f"{baseline}'s mean is 1. Interquartile mean (IQM) and probability of a better run than "
+        f"{baseline}'s, every environment weighing the same; stratified bootstrap. Over the "
+        f"environments that all of these ran on and where {baseline} is better than random beyond "
+        f"chance — {'; '.join(notes)}."
+    )
+    return text + "\n\n" + _markdown([list(row) for row in rows])
+
+
+def task_table(comparison: Comparison) -> str:
+    """Return mean and final return and the steps to the baseline's level, per environment."""
+    baseline = comparison.baseline
+    header = [
+        "environment",
+        "algorithm",
+        "seeds",
+        *METRICS.values(),
+        f"steps to {baseline}'s level",
+    ]
+    rows = [header]
+    for task in comparison.tasks:
+        for label in comparison.labels:
+            means = comparison.values(label, task, "mean_return")
+            if not len(means):
+                continue
+            final = comparison.values(label, task, "final_return")
+            has_level = label != RANDOM and comparison.has_scale(task, "mean_return")
+            steps = _steps_cell(comparison, label, task) if has_level else "-"
+            rows.append([task, label, str(len(means)), mean_cell(means), mean_cell(final), steps])
+    text = (
+        f"The level is {baseline}'s own return over the last tenth of training; a run is there "
+        "when its learning curve, averaged over a tenth of the budget, is. Median over runs "
+        f"(how many got there); no level where {baseline} is not better than random."
+    )
+    return text + "\n\n" + _markdown(rows)
+
+
+def cost_table(comparison: Comparison) -> str:
+    """Return wall and CPU time of training, and ratios to the baseline's."""
+    baseline = comparison.baseline
+    header = ["environment", "algorithm", "wall, s", "CPU, s", f"wall / {baseline}'s",
+              f"CPU / {baseline}'s"]  # fmt: skip
+    rows = [header]
+    for task in comparison.tasks:
+        for label in comparison.labels:
+            wall = comparison.values(label, task, "wall_seconds")
+            if not len(wall) or label == RANDOM:
+                continue
+            cells = [mean_cell(wall), mean_cell(comparison.values(label, task, "cpu_seconds"))]
+            for column in ("wall_seconds", "cpu_seconds"):
+                cells.append(mean_cell(comparison.paired_ratios(label, task, column), digits=2))
+            rows.append([task, label, *cells])
+    text = (
+        "Training alone, one thread. Ratios are of runs with the same seed, which ran next to each "
+        "other; other work on the machine moves wall time, CPU time less."
+    )
+    return text + "\n\n" + _markdown(rows)
+
+
+def entry_table(comparison: Comparison) -> str:
+    """Return where the hyperparameters come from."""
+    labels = [label for label in comparison.labels if label != RANDOM]
+    runs = comparison.runs
+    rows = [["environment", *labels]]
+    for task in comparison.tasks:
+        entries = [runs[(runs.task == task) & (runs.label == label)].entry for label in labels]
+        rows.append([task, *(found.iloc[-1] if len(found) else "-" for found in entries)])
+    text = (
+        "File and entry: a2c.yml, ppo.yml and trpo.yml are rl-zoo's; where it has no entry for the "
+        "environment, the nearest. The others are this repository's, `zoo_configs/`."
+    )
+    return text + "\n\n" + _markdown(rows)
+
+
+def mean_cell(values: Array, digits: int | None = None) -> str:
+    """Return ``mean [low, high]`` of runs; by default with three significant digits."""
+    if not len(values):
+        return "-"
+    estimate = bootstrap(values)
+    if digits is None:
+        digits = max(0, 2 - int(np.floor(np.log10(max(np.nanmax(np.abs(estimate)), 0.01)))))
+    return _cell(estimate, digits)
+
+
+def _cell(estimate: Estimate[float], digits: int = 2) -> str:
+    value, low, high = (f"{number:,.{digits}f}" for number in estimate)
+    return value if np.isnan(estimate.low) else f"{value} [{low}, {high}]"
+
+
+def _steps_cell(comparison: Comparison, label: str, task: str) -> str:
+    steps = comparison.steps_to_level(label, task)
+    if not len(steps):
+        return "-"
+    budget = float(comparison.curves[comparison.curves.task == task].steps.max())
+    # a bound at the budget means: the budget or more
+    estimate = bootstrap(np.minimum(steps, budget), np.median, "percentile")
+    median = f"> {budget:,.0f}" if np.isinf(np.median(steps)) else _cell(estimate, digits=0)
+    return f"{median} ({np.isfinite(steps).sum()}/{len(steps)})"
+
+
+def _markdown(rows: list[list[str]]) -> str:
+    header, *body = rows
+    lines = [header, ["---"] * len(header), *body]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
