@@ -1,6 +1,7 @@
 """Small decision processes whose J(θ), ∇J(θ) and ∇²J(θ) are known exactly, to be simulated too."""
 
 from benchmarks.exact.env import TabularEnv, TabularVectorEnv
+from benchmarks.exact.lipschitz import lipschitz_constants
 from benchmarks.exact.mdp import TabularMDP, coordination_mdp, random_mdp
 from benchmarks.exact.policy import actor_vector, assign_actor
 
@@ -11,5 +12,6 @@ __all__ = [
     "actor_vector",
     "assign_actor",
     "coordination_mdp",
+    "lipschitz_constants",
     "random_mdp",
 ]

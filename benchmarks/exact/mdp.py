@@ -89,7 +89,7 @@ class TabularMDP:
         return bool(torch.linalg.eigvalsh(self.hessian(theta))[0] >= -((rho * epsilon) ** 0.5))
 
 
-def coordination_mdp(gamma: float = 1.0) -> TabularMDP:
+def coordination_mdp(gamma: float = 1.0, noise: float = 0.0) -> TabularMDP:
     r"""Two steps, +1 if the second action repeats the first, else -1; the first one is not seen.
 
     With z_h the difference of the two logits at step h,
@@ -100,16 +100,24 @@ def coordination_mdp(gamma: float = 1.0) -> TabularMDP:
     ∇²J = -(γ/4)(∇z_0 ∇z_1ᵀ + ∇z_1 ∇z_0ᵀ). In θ, where ‖∇z_h‖² = 4 and ∇z_0·∇z_1 = 2 (the bias is
     shared), the eigenvalues are -3γ/2, four times 0, and γ/2; for separate logits in each
     observation they would be ±γ/2. The infimum, J = -γ, lies at infinity.
+
+    At the saddle itself every single episode's estimate of ∇²J is exact. ``noise`` ends that: the
+    second reward is raised or lowered by it, both equally likely, whatever is done. J is the same.
     """
-    reward = torch.tensor([[0.0, 0.0], [1.0, -1.0], [-1.0, 1.0]], dtype=torch.float64)
-    transition = torch.zeros(3, 2, 3, dtype=torch.float64)
-    transition[0, 0, 1] = transition[0, 1, 2] = 1.0
+    # states: the first step, then first action × sign of the noise
+    reward = torch.zeros(5, 2, dtype=torch.float64)
+    transition = torch.zeros(5, 2, 5, dtype=torch.float64)
     transition[1:, :, 0] = 1.0
+    for action in range(2):
+        after = slice(1 + 2 * action, 3 + 2 * action)
+        transition[0, action, after] = 0.5
+        agreement = torch.tensor([1.0, -1.0]) * (1 - 2 * action)
+        reward[after] = agreement + noise * torch.tensor([[1.0], [-1.0]])
     return TabularMDP(
-        initial=torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64),
+        initial=torch.eye(5, dtype=torch.float64)[0],
         transition=transition,
         reward=reward,
-        observation=torch.tensor([0, 1, 1]),
+        observation=torch.tensor([0, 1, 1, 1, 1]),
         horizon=2,
         gamma=gamma,
     )

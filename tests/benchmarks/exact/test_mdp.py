@@ -8,7 +8,7 @@ from benchmarks.exact import coordination_mdp, random_mdp
 from tests.mdp import TabularMDP as EnumeratedMDP
 
 MDPS = [
-    coordination_mdp(gamma=0.9),
+    coordination_mdp(gamma=0.9, noise=0.5),
     random_mdp(0, n_states=3, horizon=3),
     random_mdp(1, n_states=3, n_actions=3, horizon=3),
     random_mdp(2, n_states=4, n_observations=2, horizon=3),  # aliased
@@ -87,18 +87,19 @@ def test_values_are_what_is_left_to_gain(mdp):
 
 
 @pytest.mark.parametrize("gamma", [1.0, 0.7])
-def test_the_uniform_policy_of_the_coordination_mdp_is_a_strict_saddle(gamma):
-    mdp = coordination_mdp(gamma)
+@pytest.mark.parametrize("noise", [0.0, 3.0])
+def test_the_uniform_policy_of_the_coordination_mdp_is_a_strict_saddle(gamma, noise):
+    mdp = coordination_mdp(gamma, noise)
     uniform = torch.zeros(mdp.n_parameters, dtype=torch.float64)
-    assert mdp.cost(uniform) == 0.0
-    assert not mdp.gradient(uniform).any()
+    assert mdp.cost(uniform) == pytest.approx(0.0, abs=1e-15)
+    torch.testing.assert_close(mdp.gradient(uniform), uniform, rtol=0, atol=1e-15)
     eigenvalues = torch.linalg.eigvalsh(mdp.hessian(uniform))
     expected = torch.tensor([-1.5, 0, 0, 0, 0, 0.5], dtype=torch.float64) * gamma
     torch.testing.assert_close(eigenvalues, expected, rtol=0, atol=1e-14)
 
 
 def test_the_cost_of_the_coordination_mdp_is_the_product_of_two_tangents():
-    mdp = coordination_mdp(0.9)
+    mdp = coordination_mdp(0.9, noise=2.0)
     theta = parameters(mdp)
     first, second, bias = theta[[2, 3, 5]] - theta[[0, 1, 4]]
     expected = -0.9 * torch.tanh((first + bias) / 2) * torch.tanh((second + bias) / 2)

@@ -1,0 +1,263 @@
+"""The learning benchmark: curves, settings, storage, statistics, and one run from end to end."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+pytest.importorskip("rl_zoo3")
+
+from benchmarks.learning import comparison, store, tables
+from benchmarks.learning.run import N_BINS, Result, Run, learning_curve
+from benchmarks.learning.settings import (
+    ALGORITHMS,
+    BUDGETS,
+    describe,
+    find_entry,
+    parse_setting,
+    resolve,
+    same_hyperparameters,
+)
+from benchmarks.learning.statistics import (
+    bootstrap,
+    improvement,
+    interquartile_mean,
+    performance_profile,
+    stratified_bootstrap,
+)
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_each_step_counts_the_return_of_its_episode() -> None:
+    # 25 steps of return 1, 50 of return 3; 5 steps of a cut episode, then 20 of return 10
+    mean, curve = learning_curve([(25, 25, 1.0), (75, 50, 3.0), (100, 20, 10.0)], 1, 100)
+    steps, values = np.array(curve).T
+    assert mean == pytest.approx((25 * 1 + 50 * 3 + 20 * 10) / 95)
+    np.testing.assert_array_equal(steps, np.arange(2, 101, 2))
+    np.testing.assert_allclose(values[:12], 1)
+    assert values[12] == pytest.approx(2)  # the bin (24, 26] has a step of either
+    np.testing.assert_allclose(values[13:37], 3)
+    assert np.isnan(values[38])  # (76, 78]: in the episode that was cut
+    np.testing.assert_allclose(values[40:], 10)
+
+
+def test_parallel_environments_share_the_steps() -> None:
+    # each of two environments runs one episode over all 2 × 50 steps
+    mean, curve = learning_curve([(100, 50, 0.0), (100, 50, 4.0)], 2, 100)
+    assert mean == 2
+    np.testing.assert_allclose([value for _, value in curve], 2)
+
+
+def test_episode_beyond_the_budget_counts_up_to_it() -> None:
+    mean, _ = learning_curve([(80, 80, 0.0), (120, 40, 1.0)], 1, 100)
+    assert mean == pytest.approx(0.2)
+
+
+def test_no_episode_no_mean() -> None:
+    mean, curve = learning_curve([], 1, 100)
+    assert np.isnan(mean)
+    assert np.isnan([value for _, value in curve]).all()
+    assert len(curve) == N_BINS
+
+
+def test_setting_is_read_as_literals_or_text() -> None:
+    text = "n_steps=512,metric=euclidean,learning_rate=lin_1e-3,policy_kwargs=dict(net_arch=[8, 8])"
+    assert parse_setting(text) == {
+        "n_steps": 512,
+        "metric": "euclidean",
+        "learning_rate": "lin_1e-3",
+        "policy_kwargs": "dict(net_arch=[8, 8])",
+    }
+    assert parse_setting("") == {}
+
+
+@pytest.mark.parametrize("setting", ["n_steps", "n_steps=", "**x", "a=1)+dict(b=2"])
+def test_malformed_setting_is_named(setting: str) -> None:
+    with pytest.raises(ValueError, match="is not allowed, must be key=value"):
+        parse_setting(setting)
+
+
+def test_entry_is_exact_then_another_version_then_the_nearest_then_the_default() -> None:
+    entries = dict.fromkeys(["A-v1", "A-v4", "AB-v9", "B-v0", "default"])
+    assert find_entry(entries, "A-v1", {}) == "A-v1"
+    assert find_entry(entries, "A-v5", {"A-v5": "B-v0"}) == "A-v4"
+    assert find_entry(entries, "C-v5", {"C-v5": "B-v0"}) == "B-v0"
+    assert find_entry(entries, "C-v5", {}) == "default"
+    assert find_entry({}, "C-v5", {}) is None
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_every_benchmark_task_has_an_entry_of_its_own(algo: str) -> None:
+    for env in BUDGETS:
+        entry, arguments = resolve(algo, env, {"gamma": 0.5})
+        assert entry.split(": ")[1] != "default"
+        assert "gamma=0.5" in describe(algo, arguments)
+
+
+def test_reinforce_has_crpns_entry_without_what_only_newton_steps_use() -> None:
+    crpn, reinforce = (resolve(algo, "CartPole-v1", {})[1] for algo in ("CRPN", "REINFORCE"))
+    assert "target_kl" in crpn
+    assert reinforce == {key: crpn[key] for key in crpn if key != "target_kl"}
+    assert "actor_learning_rate=" in describe("REINFORCE", reinforce)
+
+
+def test_a_new_argument_does_not_make_another_run_but_another_value_does() -> None:
+    assert same_hyperparameters("a=1; b=2", "a=1; b=2; c=3")
+    assert not same_hyperparameters("a=1; b=2", "a=1; b=3")
+    assert same_hyperparameters("", "")
+
+
+def _run(algo: str, seed: int, hyperparameters: str = "a=1", env: str = "CartPole-v1") -> Run:
+    return Run(algo, env, "", 100_000, seed, hyperparameters, "entry", {})
+
+
+def _result(mean: float, curve: np.ndarray) -> Result:
+    row = {"mean_return": mean, "final_return": 2 * mean, "steps": 100_000, "episodes": 9,
+           "wall_seconds": 3.0, "cpu_seconds": 2.0, "versions": ""}  # fmt: skip
+    steps = np.linspace(0, 100_000, len(curve) + 1)[1:]
+    return Result(row, [(int(s), float(v)) for s, v in zip(steps, curve, strict=True)])
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    """TRPO learns linearly to 100, CRPN twice as fast; random is 20. MountainCar is not learnt."""
+    ramp = np.linspace(2, 100, 50)
+    for seed in range(3):
+        for algo, mean, curve in [
+            ("Random", 20.0, np.array([])),
+            ("TRPO", 50.0 + seed, ramp),
+            ("CRPN", 75.0 + seed, np.minimum(2 * ramp, 100)),
+        ]:
+            store.append(tmp_path, _run(algo, seed), _result(mean, curve))
+            flat = _result(-200.0, np.full(50, -200.0))
+            store.append(tmp_path, _run(algo, seed, env="MountainCar-v0"), flat)
+    return tmp_path
+
+
+def test_a_repeated_run_replaces_the_first(results: Path) -> None:
+    store.append(results, _run("CRPN", 0, "a=2"), _result(7.0, np.full(50, 7.0)))
+    runs, curves = store.read_runs(results), store.read_curves(results)
+    assert len(runs) == 18
+    assert not runs.duplicated(list(store.KEYS)).any()
+    is_repeated = (curves.algo == "CRPN") & (curves.seed == 0) & (curves.env == "CartPole-v1")
+    assert (curves[is_repeated]["return"] == 7).all()
+    assert is_repeated.sum() == 50
+
+
+def test_runs_of_outdated_hyperparameters_are_left_out(results: Path) -> None:
+    store.append(results, _run("CRPN", 0, "a=2"), _result(7.0, np.full(50, 7.0)))
+    found = comparison.load(results, "TRPO")
+    assert found.n_outdated == 2
+    np.testing.assert_array_equal(found.values("CRPN", "CartPole-v1", "mean_return"), [7])
+    assert list(found.learning_curves("CRPN", "CartPole-v1")) == [0]
+
+
+def test_scores_are_zero_for_random_and_one_for_the_baseline(results: Path) -> None:
+    found = comparison.load(results, "TRPO")
+    labels = ["CRPN", "TRPO"]
+    assert found.comparable_tasks(labels, "mean_return") == ["CartPole-v1"]
+    scores = found.scores(labels, ["CartPole-v1"], "mean_return")
+    assert np.mean(scores["TRPO"]) == pytest.approx(1)
+    np.testing.assert_allclose(scores["CRPN"][0], (np.array([75, 76, 77]) - 20) / (51 - 20))
+
+
+def test_steps_to_the_baselines_level(results: Path) -> None:
+    found = comparison.load(results, "TRPO")
+    assert found.level("CartPole-v1") == pytest.approx(96)  # the mean of 92, 94, …, 100
+    # CRPN's curve is 4, 8, …, 100, 100, …: its mean over 5 bins is first ≥ 96 at bin 26
+    np.testing.assert_array_equal(found.steps_to_level("CRPN", "CartPole-v1"), [52_000] * 3)
+    np.testing.assert_array_equal(found.steps_to_level("TRPO", "CartPole-v1"), [100_000] * 3)
+    frame = found.curves.copy()
+    frame.loc[frame.label == "CRPN", "return"] = 95.0
+    never = comparison.Comparison(found.runs, frame, "TRPO", 0)
+    assert np.isinf(never.steps_to_level("CRPN", "CartPole-v1")).all()
+
+
+def test_tables_say_what_the_rows_say(results: Path) -> None:
+    text = tables.report(comparison.load(results, "TRPO"))
+    assert "| CartPole-v1 | CRPN | 3 | 76.0 [75.0, 76.7] | 152 [150, 153] | 52,000" in text
+    assert "| MountainCar-v0 | CRPN | 3 | -200 [-200, -200] | -200" in text
+    assert "| CRPN | 1.81 " in text  # 56 / 31
+
+
+def test_interquartile_mean_is_scipys_for_equal_numbers_of_seeds() -> None:
+    rng = np.random.default_rng(0)
+    samples = list(rng.normal(size=(4, 6)))
+    expected = stats.trim_mean(np.concatenate(samples), 0.25)
+    assert interquartile_mean(samples) == pytest.approx(expected)
+    # twice the seeds do not weigh an environment twice
+    doubled = [np.repeat(samples[0], 2), *samples[1:]]
+    assert interquartile_mean(doubled) == pytest.approx(expected)
+
+
+def test_probability_of_improvement_is_mann_whitneys() -> None:
+    rng = np.random.default_rng(1)
+    x, y = rng.integers(0, 5, (2, 8)).astype(float)
+    expected = stats.mannwhitneyu(x, y).statistic / 64
+    assert improvement([x], [y]).value == pytest.approx(expected)
+    assert improvement([x], [x - 10]) == (1, 1, 1)
+
+
+def test_performance_profile_is_a_fraction_of_runs() -> None:
+    profile = performance_profile([np.array([0.0, 2.0]), np.array([1.0])], np.array([-1, 0.5, 3]))
+    np.testing.assert_allclose(profile, [1, 0.75, 0])
+
+
+def test_intervals() -> None:
+    values = np.random.default_rng(2).normal(size=400)
+    mean, low, high = bootstrap(values)
+    assert low < mean < high
+    assert high - low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.1)
+    assert stratified_bootstrap([values], lambda s: float(s[0].mean())) == pytest.approx(
+        (mean, low, high), abs=0.01
+    )
+    assert bootstrap(np.full(3, 5.0)) == (5, 5, 5)
+    alone = bootstrap(np.array([5.0]))
+    assert alone.value == 5
+    assert np.isnan(alone.low)
+
+
+def test_command_runs_resumes_and_reports(tmp_path: Path) -> None:
+    options = ["--results", str(tmp_path)]
+    train = ["--algos", "CRPN", "TRPO", "Random", "--envs", "CartPole-v1", "--seeds", "1",
+             "--timesteps", "1200", "--jobs", "1", *options]  # fmt: skip
+    assert "0 of 3 runs are done" in _command("benchmarks.learning", *train)
+    first = (tmp_path / "runs.csv").read_text()
+    assert "3 of 3 runs are done" in _command("benchmarks.learning", *train)
+    assert (tmp_path / "runs.csv").read_text() == first
+    runs = store.read_runs(tmp_path).set_index("algo")
+    assert runs.steps[["CRPN", "TRPO"]].eq(1200).all()
+    assert runs.mean_return.between(9, 500).all()
+    assert runs.entry["TRPO"] == "trpo.yml: CartPole-v1"
+    assert set(store.read_curves(tmp_path).algo) == {"CRPN", "TRPO"}
+    task = "CartPole-v1 (1,200 steps)"
+    _command("benchmarks.learning.report", *options, "--write", str(tmp_path), "--curve-envs", task)
+    assert f"| {task} | CRPN | 1 |" in (tmp_path / "benchmark.md").read_text()
+    for name in ("learning_curves.png", "aggregate.png"):
+        assert (tmp_path / name).stat().st_size > 10_000
+
+
+def _command(*arguments: str) -> str:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-m", *arguments],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_curves_hold_missing_points_as_nan(tmp_path: Path) -> None:
+    store.append(tmp_path, _run("CRPN", 0), _result(1.0, np.array([np.nan, 1.0])))
+    assert store.read_curves(tmp_path)["return"].isna().tolist() == [True, False]
+    assert isinstance(store.read_runs(tmp_path), pd.DataFrame)
