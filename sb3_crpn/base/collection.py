@@ -108,6 +108,8 @@ class EpisodeCollection(OnPolicyAlgorithm):
                 # where the environments stand is unknown: the next rollout resets them
                 self._last_episode_starts = np.zeros(env.num_envs, dtype=bool)
         if completed:
+            if self.uses_critic:
+                rollout_buffer.evaluate(self.policy)
             rollout_buffer.compute_advantages()
         return completed
 
@@ -126,13 +128,14 @@ class EpisodeCollection(OnPolicyAlgorithm):
         tracker = EpisodeTracker(quotas, np.array(self._last_episode_starts, bool), self.horizon)
         rollout_buffer.reset()
         n_steps = last_end = 0
+        unknown = torch.zeros(env.num_envs)  # V and log π: evaluated at the end, all at once
         callback.on_rollout_start()
         while not tracker.complete:
             if self.use_sde and (
                 n_steps == 0 or (self.sde_sample_freq > 0 and n_steps % self.sde_sample_freq == 0)
             ):
                 self.policy.reset_noise(env.num_envs)
-            actions, clipped_actions, values, log_probs = self._act(self._last_obs)
+            actions, clipped_actions = self._act(self._last_obs)
             new_obs, rewards, dones, infos = env.step(clipped_actions)
             self.num_timesteps += env.num_envs
             _require_finite("reward", rewards, self.num_timesteps)
@@ -143,7 +146,7 @@ class EpisodeCollection(OnPolicyAlgorithm):
             self._update_info_buffer(infos, dones)
             n_steps += 1
             rollout_buffer.add(
-                self._last_obs, actions, rewards, self._last_episode_starts, values, log_probs
+                self._last_obs, actions, rewards, self._last_episode_starts, unknown, unknown
             )
             for end in tracker.advance(dones):
                 last_end = n_steps
@@ -205,19 +208,17 @@ class EpisodeCollection(OnPolicyAlgorithm):
         assert isinstance(buffer, EpisodeRolloutBuffer)  # by check_arguments
         return buffer
 
-    def _act(self, obs: Any) -> tuple[Array, Array, torch.Tensor, torch.Tensor]:
-        """Sample actions; return them raw and as the environment takes them, with V and log π."""
+    def _act(self, obs: Any) -> tuple[Array, Array]:
+        """Sample actions; return them raw and as the environment takes them."""
         with torch.no_grad():
-            sampled, values, log_probs = self.policy(obs_as_tensor(obs, self.device))
-        if not self.uses_critic:
-            values = torch.zeros_like(values)  # lest it leaves its rounding in the returns
-        actions = sampled.cpu().numpy()
+            distribution = self.policy.get_distribution(obs_as_tensor(obs, self.device))
+            sampled = distribution.get_actions()
+        actions = sampled.cpu().numpy().reshape(-1, *(self.action_space.shape or ()))
         if not isinstance(self.action_space, spaces.Box):
-            return actions, actions, values, log_probs
+            return actions, actions
         if self.policy.squash_output:
-            return actions, self.policy.unscale_action(actions), values, log_probs
-        low, high = self.action_space.low, self.action_space.high
-        return actions, np.clip(actions, low, high), values, log_probs
+            return actions, self.policy.unscale_action(actions)
+        return actions, np.clip(actions, self.action_space.low, self.action_space.high)
 
     def _terminal_value(self, end: EpisodeEnd, new_obs: Any, infos: list[dict[str, Any]]) -> float:
         """Return V of the state after a truncated episode, 0 after a terminated one."""
