@@ -24,7 +24,7 @@ NUMBERS = spaces.Box(-1.0, 1.0, (3,))
 
 
 def mean_kl(model, observations, before, after):
-    """Mean KL(π_before ‖ π_after) over states, summed over the action's components."""
+    """Mean KL(π_before ‖ π_after) over states and the action's components."""
     policies = []
     for theta in (before, after):
         policy = copy.deepcopy(model)
@@ -34,7 +34,7 @@ def mean_kl(model, observations, before, after):
     if isinstance(policies[0], MultiCategoricalDistribution):
         pairs = zip(policies[0].distribution, policies[1].distribution, strict=True)
     kl = [torch.distributions.kl_divergence(old, new) for old, new in pairs]
-    return sum(part.reshape(len(part), -1).sum(1) for part in kl).mean().item()
+    return torch.stack([part.mean() for part in kl]).mean().item()
 
 
 class States(BaseCallback):

@@ -227,8 +227,8 @@ def test_identity(algorithm, kind):
     env = DummyVecEnv([IDENTITY[kind]] * 4)
     for seed, identity in enumerate(env.envs):
         identity.action_space.seed(seed)
-    model = make(algorithm, env, n_episodes=4, gamma=0.0, target_kl=0.4, net_arch=[16])
-    model.learn(3200)
+    model = make(algorithm, env, n_episodes=4, gamma=0.0, target_kl=0.1, net_arch=[16])
+    model.learn(6000)
     evaluate_policy(model, VecMonitor(env), 4, reward_threshold=90)
 
 

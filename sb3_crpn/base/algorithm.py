@@ -55,7 +55,8 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         α of the cubic term, a float or a schedule. With ``target_kl`` only the first guess.
     target_kl
         Mean KL divergence KL(old ‖ new) that each step keeps, met within 10 % by the choice of α;
-        ``None``: α follows its schedule.
+        the mean is over states and action components, as in sb3-contrib's TRPO. ``None``: α
+        follows its schedule.
     metric
         "fisher": M = F + εI; "euclidean": M = I, the paper's.
     fisher_damping

@@ -26,7 +26,7 @@ class Trial:
     Attributes
     ----------
     kl
-        Mean KL(π_θ ‖ π_θ+s) over the batch's states.
+        Mean KL(π_θ ‖ π_θ+s) over the batch's states and the action's components.
     surrogate_change
         (1/m) Σ_i A_i (π_θ+s/π_θ - 1): negative is an improvement.
     """

@@ -82,7 +82,8 @@ class CurvatureEstimate:
     hessian
         H ≈ ∇²J(θ).
     fisher
-        F, the policy's Fisher matrix, a mean over the steps of the gradient's episodes.
+        F, the policy's Fisher matrix, a mean over the steps of the gradient's episodes and over
+        the action's components.
     gradient_noise
         Estimate of E‖g - ∇J‖² / ‖g‖², from the disagreement of groups; nan for one episode.
     gradient_batch

@@ -10,7 +10,11 @@ from typing import Literal
 
 import numpy as np
 import torch
-from stable_baselines3.common.distributions import Distribution, kl_divergence
+from stable_baselines3.common.distributions import (
+    Distribution,
+    MultiCategoricalDistribution,
+    kl_divergence,
+)
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_crpn.episodes.batch import EpisodeBatch, FloatArray, IntArray, episode_scan, episode_starts
@@ -25,9 +29,15 @@ def policy_distribution(policy: ActorCriticPolicy, batch: EpisodeBatch) -> Distr
 
 
 def mean_divergence(old: Distribution, new: Distribution) -> torch.Tensor:
-    """Return the mean over the states of KL(old ‖ new), a scalar."""
-    divergence = kl_divergence(old, new)  # SB3 keeps independent action dimensions apart
-    return divergence.sum() / len(divergence)
+    """Return the mean of KL(old ‖ new) over the states and the action's k components, a scalar.
+
+    The mean, not the sum, over components is what sb3-contrib's TRPO bounds: a step of one and
+    the same divergence changes each component as much whether there are one or twenty.
+    """
+    divergence = kl_divergence(old, new)  # [T], or [T, k] where SB3 keeps the components apart
+    if isinstance(old, MultiCategoricalDistribution):  # which SB3 sums
+        divergence = divergence / len(old.action_dims)
+    return divergence.mean()
 
 
 @dataclass(frozen=True)
@@ -164,9 +174,9 @@ class EpisodeGroup:
         return total / self.batch.n_episodes
 
     def fisher_product(self, vector: torch.Tensor) -> torch.Tensor:
-        """Return Fv, F = (1/T) Σ_i E_{a~π(·|s_i)}[σσᵀ] = ∇² mean KL, [d].
+        """Return Fv, F = (1/kT) Σ_i E_{a~π(·|s_i)}[σσᵀ] for actions of k components, [d].
 
-        The expectation over actions is exact: F is the second derivative of the KL divergence.
+        The expectation over actions is exact: F is the second derivative of `mean_divergence`.
         """
         along = _inner(self._kl_gradient, self._actor.unflatten(vector))
         product = torch.autograd.grad(

@@ -148,6 +148,10 @@ def test_single_precision_agrees(kind):
     torch.testing.assert_close(single.gradient(), exact.gradient(), rtol=1e-3, atol=1e-5)
 
 
+def n_components(kind):
+    return 1 if kind == "discrete" else int(np.prod(ACTION_SPACES[kind].shape))
+
+
 def all_actions(kind):
     space = ACTION_SPACES[kind]
     if kind == "discrete":
@@ -166,6 +170,7 @@ def test_fisher_is_the_expected_outer_product_of_scores(kind):
             log_prob = distribution.log_prob(action[None]).squeeze()
             score = flat_gradient(log_prob, actor)
             expected += log_prob.exp().detach() * torch.outer(score, score) / batch.n_steps
+    expected /= n_components(kind)
     fisher = columns(group.fisher_product, len(actor))
     torch.testing.assert_close(fisher, expected, rtol=1e-9, atol=1e-7)
 
@@ -178,7 +183,7 @@ def test_fisher_of_a_gaussian_is_that_of_its_mean_and_scale():
         natural = torch.cat([normal.mean[0], normal.stddev[0].log()])
         J = torch.stack([flat_gradient(z, actor) for z in natural])
         F = torch.cat([normal.stddev[0] ** -2, torch.full((2,), 2.0)]).detach()
-        expected += J.T @ (F[:, None] * J) / batch.n_steps
+        expected += J.T @ (F[:, None] * J) / batch.n_steps / n_components("gaussian")
     fisher = columns(group.fisher_product, len(actor))
     torch.testing.assert_close(fisher, expected, rtol=1e-9, atol=1e-12)
 
@@ -194,7 +199,7 @@ def test_fisher_predicts_the_mean_divergence(kind):
         before = policy_distribution(policy, batch)
         actor.assign(actor.vector + step)
         divergence = kl_divergence(before, policy_distribution(policy, batch))
-    mean = divergence.reshape(batch.n_steps, -1).sum(1).mean()
+    mean = divergence.sum() / batch.n_steps / n_components(kind)
     torch.testing.assert_close(predicted, mean, rtol=1e-2, atol=0)
 
 
