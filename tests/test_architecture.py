@@ -25,7 +25,8 @@ LAYERS = {
     "acrpn": {"cubic", "curvature", "base"},
     "sosp": {"cubic", "parameters", "distributed", "curvature", "base"},
     "theory": set(),
-    "__init__": {"crpn", "acrpn", "sosp", "theory"},
+    "callbacks": {"base"},
+    "__init__": {"crpn", "acrpn", "sosp", "theory", "callbacks"},
     "zoo": {"crpn", "acrpn", "__init__"},
 }
 ARRAYS = {"numpy", "scipy", "torch"}
