@@ -1,0 +1,31 @@
+"""The constants of the convergence theory and the parameters that it asks for.
+
+>>> from sb3_crpn.theory import Constants, expectation_recipe, softmax_linear
+>>> constants = Constants(K=1.0, scores=softmax_linear(feature_norm=1.0), H=1, d=4)
+>>> recipe = expectation_recipe(constants, epsilon=0.5)
+>>> sorted(recipe.kwargs)
+['alpha', 'gamma', 'horizon', 'n_episodes', 'n_hessian_episodes']
+
+Symbols are those of Maniyar et al., AISTATS 2024. Their values are derived here, in the docstrings,
+and tested against enumerated decision processes; they may be smaller than the printed ones.
+"""
+
+from sb3_crpn.theory.constants import Constants
+from sb3_crpn.theory.policies import ScoreBounds, gaussian_linear, softmax_linear
+from sb3_crpn.theory.recipes import (
+    Recipe,
+    approximate_recipe,
+    expectation_recipe,
+    high_probability_recipe,
+)
+
+__all__ = [
+    "Constants",
+    "Recipe",
+    "ScoreBounds",
+    "approximate_recipe",
+    "expectation_recipe",
+    "gaussian_linear",
+    "high_probability_recipe",
+    "softmax_linear",
+]

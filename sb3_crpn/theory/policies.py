@@ -1,0 +1,119 @@
+"""G, L_1 and L_2: bounds on log π for policies that are linear in bounded features."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from sb3_crpn.theory.checks import require_count, require_positive, require_real
+
+
+@dataclass(frozen=True)
+class ScoreBounds:
+    """How fast log π(a|s;θ) and its derivatives can change with θ, for all s, a and θ.
+
+    Norms are Euclidean and spectral. Units: reciprocals of θ's, squared for L_1, cubed for L_2.
+
+    Attributes
+    ----------
+    G
+        ‖∇log π‖ ≤ G.
+    L_1
+        ‖∇²log π‖ ≤ L_1.
+    L_2
+        ‖∇²log π(a|s;θ) - ∇²log π(a|s;θ')‖ ≤ L_2 ‖θ - θ'‖.
+    """
+
+    G: float
+    L_1: float
+    L_2: float
+
+    def __post_init__(self) -> None:
+        require_positive("G", self.G)
+        require_real("L_1", self.L_1, 0.0)
+        require_real("L_2", self.L_2, 0.0)
+
+
+def softmax_linear(feature_norm: float, *, bias: bool = True) -> ScoreBounds:
+    """Return the bounds of π(·|s) = softmax(Wφ(s) + b), ‖φ(s)‖ ≤ ``feature_norm``.
+
+    SB3's policy on a Discrete action space with ``net_arch=[]``; φ is the observation, of norm 1
+    for a Discrete one.
+
+    With B² = ‖φ‖² (+ 1 for b), the derivatives of log π are those of log-sum-exp, the cumulants of
+    the one-hot action e_a under π, times powers of φ:
+
+    - ∇log π = (e_a - π) ⊗ φ, and ‖e_a - π‖ < √2: G = √2·B, approached where a is improbable;
+    - -∇²log π = Cov(e_a) ⊗ φφᵀ. For a unit vector u, u_a has range ≤ √2, its variance is at most
+      √2²/4: L_1 = B²/2, attained by two equally probable actions;
+    - -∇³log π [v, v, v] is the third central moment of (Vφ)_a, at most range³/(6√3):
+      L_2 = (√6/9)·B³, attained by two actions of probabilities (1 ± 1/√3)/2.
+
+    Parameters
+    ----------
+    feature_norm
+        Bound on ‖φ(s)‖, > 0.
+    bias
+        Whether b is a parameter too, as in SB3.
+    """
+    norm = _norm(feature_norm, bias)
+    return ScoreBounds(
+        G=math.sqrt(2.0) * norm, L_1=norm**2 / 2.0, L_2=math.sqrt(6.0) / 9.0 * norm**3
+    )
+
+
+def gaussian_linear(
+    feature_norm: float,
+    std: float,
+    action_dim: int,
+    *,
+    n_actions: int,
+    failure_probability: float,
+    bias: bool = True,
+) -> ScoreBounds:
+    """Return the bounds of π(·|s) = N(Wφ(s) + b, Σ) with fixed, diagonal Σ.
+
+    **G is not a bound for every action**: the score Σ⁻¹(a - μ) ⊗ φ of a Gaussian policy is
+    unbounded. It holds for all of the first ``n_actions`` actions with probability at least
+    1 - ``failure_probability``. Clipping actions on their way to the environment, as SB3 does,
+    changes nothing: log π is that of the unclipped action.
+
+    With B² = ‖φ‖² (+ 1 for b) and ξ = Σ^(-½)(a - μ) standard normal of dimension k:
+
+    - ‖∇log π‖ ≤ (B/std)‖ξ‖, and ‖ξ‖² ≤ k + 2√(kx) + 2x but for probability e^(-x) (Laurent and
+      Massart, Ann. Statist. 28, 2000, Lemma 1); x = log(n_actions/failure_probability);
+    - ∇²log π = -Σ⁻¹ ⊗ φφᵀ: L_1 = B²/std², whatever the action;
+    - ∇²log π does not depend on θ: L_2 = 0.
+
+    SB3's log_std is a parameter by default; these bounds are those of a policy in which it is not
+    (``policy.log_std.requires_grad_(False)`` before the algorithm selects the actor).
+
+    Parameters
+    ----------
+    feature_norm
+        Bound on ‖φ(s)‖, > 0.
+    std
+        The smallest standard deviation, > 0.
+    action_dim
+        k, the dimension of the action.
+    n_actions
+        The number of actions drawn, of all updates and environments together.
+    failure_probability
+        In (0, 1].
+    bias
+        Whether b is a parameter too, as in SB3.
+    """
+    norm = _norm(feature_norm, bias)
+    require_positive("std", std)
+    require_count("action_dim", action_dim)
+    require_count("n_actions", n_actions)
+    require_positive("failure_probability", failure_probability, 1.0)
+    x = math.log(n_actions / failure_probability)
+    noise = math.sqrt(action_dim + 2.0 * math.sqrt(action_dim * x) + 2.0 * x)
+    return ScoreBounds(G=noise * norm / std, L_1=(norm / std) ** 2, L_2=0.0)
+
+
+def _norm(feature_norm: float, bias: bool) -> float:
+    """Return the norm of the features, with the constant feature of a bias."""
+    require_positive("feature_norm", feature_norm)
+    return math.hypot(feature_norm, 1.0) if bias else feature_norm
