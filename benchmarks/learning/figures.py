@@ -84,9 +84,7 @@ def save_aggregate(comparison: Comparison, path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
-def _draw_estimate(
-    ax: Axes, place: float, estimate: Estimate[float], label: str, *, filled: bool
-) -> None:
+def _draw_estimate(ax: Axes, place: float, estimate: Estimate, label: str, *, filled: bool) -> None:
     colour = COLOURS.get(label, "0.4")
     ax.plot([estimate.low, estimate.high], [place, place], color=colour, linewidth=2)
     ax.plot(estimate.value, place, "o", color=colour, mfc=colour if filled else "white")

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.learning.settings import ALGORITHMS, RANDOM, register_algorithms
+from benchmarks.learning.settings import ALGORITHMS, RANDOM
+from sb3_crpn import zoo
 
 N_BINS = 50  # points of a learning curve
 N_EVAL_EPISODES = 20
@@ -81,13 +82,14 @@ def _train(run: Run) -> Result:
         eval_env.seed(EVAL_SEED + run.seed)
         sync_envs_normalization(model.get_env(), eval_env)
         final, _ = evaluate_policy(model, eval_env, N_EVAL_EPISODES, deterministic=True, warn=False)
-        n_envs = model.n_envs
+        n_envs, steps = model.n_envs, min(model.num_timesteps, run.timesteps)
         model.get_env().close()
         eval_env.close()
     mean, curve = learning_curve(recorder.episodes, n_envs, run.timesteps)
     row = {
         "mean_return": mean,
         "final_return": final,
+        "steps": steps,
         "episodes": len(recorder.episodes),
         "wall_seconds": wall,
         "cpu_seconds": cpu,
@@ -100,8 +102,12 @@ def _set_up(run: Run, folder: Path) -> tuple[Any, Any]:
     """Return rl-zoo's manager and the model, made from the run's hyperparameters as rl-zoo does."""
     import yaml
     from rl_zoo3.exp_manager import ExperimentManager
+    from rl_zoo3.utils import ALGOS
 
-    register_algorithms()
+    from benchmarks.reinforce import REINFORCE
+
+    zoo.register()
+    ALGOS.update(reinforce=REINFORCE)  # in place, as zoo does
     arguments = {**run.arguments, "n_timesteps": run.timesteps}
     if _has_dict_observations(run.env):
         arguments["policy"] = "MultiInputPolicy"
@@ -216,6 +222,7 @@ def _evaluate_random(run: Run) -> Result:
     row = {
         "mean_return": np.average(returns, weights=lengths),
         "final_return": np.mean(returns),
+        "steps": sum(lengths),
         "episodes": len(returns),
         "wall_seconds": time.perf_counter() - wall,
         "cpu_seconds": time.process_time() - cpu,

@@ -19,61 +19,41 @@ from typing import Any
 
 from sb3_crpn import PAPER, zoo
 
-_CLASSIC = (
-    "CartPole-v1",
-    "Acrobot-v1",
-    "MountainCar-v0",
-    "MountainCarContinuous-v0",
-    "Pendulum-v1",
-)
-_BOX2D = ("LunarLander-v3", "LunarLanderContinuous-v3")
-_MUJOCO = (
-    "Reacher-v5",
-    "InvertedPendulum-v5",
-    "InvertedDoublePendulum-v5",
-    "Swimmer-v5",
-    "Hopper-v5",
-    "HalfCheetah-v5",
-)
 # Environment steps of a run
 BUDGETS: dict[str, int] = {
-    **dict.fromkeys(_CLASSIC, 100_000),
-    **dict.fromkeys(_BOX2D, 200_000),
-    **dict.fromkeys(_MUJOCO, 300_000),
+    "CartPole-v1": 100_000,
+    "Acrobot-v1": 100_000,
+    "MountainCar-v0": 100_000,
+    "MountainCarContinuous-v0": 100_000,
+    "Pendulum-v1": 100_000,
+    "LunarLander-v3": 200_000,
+    "LunarLanderContinuous-v3": 200_000,
+    "Reacher-v5": 300_000,
+    "InvertedPendulum-v5": 300_000,
+    "InvertedDoublePendulum-v5": 300_000,
+    "Swimmer-v5": 300_000,
+    "Hopper-v5": 300_000,
+    "HalfCheetah-v5": 300_000,
     "FetchReachDense-v4": 100_000,
 }
 
 # The entry for tasks that a file of hyperparameters lacks in every version. rl-zoo's Hopper-v4 is
 # its MuJoCo default for A2C and TRPO, and Ant-v4 is for PPO; the Bullet entries for the pendulums
-# are marked "To be tuned", the one for Reacher "Tuned". The paper's entries follow the actions.
+# are marked "To be tuned", the one for Reacher "Tuned".
+_NO_MUJOCO_ENTRY = {
+    "InvertedPendulum-v5": "Hopper-v4",
+    "InvertedDoublePendulum-v5": "Hopper-v4",
+    "Reacher-v5": "ReacherBulletEnv-v0",
+    "FetchReachDense-v4": "Hopper-v4",
+}
+_DISCRETE = ("CartPole-v1", "Acrobot-v1", "MountainCar-v0", "LunarLander-v3")
+_BY_ACTIONS = {env: "CartPole-v1" if env in _DISCRETE else "Reacher-v5" for env in BUDGETS}
 NEAREST: dict[str, dict[str, str]] = {
-    "a2c.yml": {
-        "InvertedPendulum-v5": "Hopper-v4",
-        "InvertedDoublePendulum-v5": "Hopper-v4",
-        "Reacher-v5": "ReacherBulletEnv-v0",
-        "FetchReachDense-v4": "Hopper-v4",
-    },
+    "a2c.yml": _NO_MUJOCO_ENTRY,
+    "trpo.yml": _NO_MUJOCO_ENTRY,
     "ppo.yml": {"FetchReachDense-v4": "Ant-v4"},
-    "trpo.yml": {
-        "InvertedPendulum-v5": "Hopper-v4",
-        "InvertedDoublePendulum-v5": "Hopper-v4",
-        "Reacher-v5": "ReacherBulletEnv-v0",
-        "FetchReachDense-v4": "Hopper-v4",
-    },
-    **dict.fromkeys(
-        ("crpn_paper.yml", "acrpn_paper.yml"),
-        dict.fromkeys(("Acrobot-v1", "MountainCar-v0", "LunarLander-v3"), "CartPole-v1")
-        | dict.fromkeys(
-            (
-                "MountainCarContinuous-v0",
-                "Pendulum-v1",
-                "LunarLanderContinuous-v3",
-                *_MUJOCO[1:],
-                "FetchReachDense-v4",
-            ),
-            "Reacher-v5",
-        ),
-    ),
+    "crpn_paper.yml": _BY_ACTIONS,
+    "acrpn_paper.yml": _BY_ACTIONS,
 }
 
 # Settings of a run that are no constructor arguments, with rl-zoo's defaults
@@ -133,17 +113,6 @@ ALGORITHMS: dict[str, Algorithm] = {
 RANDOM = "Random"
 
 
-def register_algorithms() -> dict[str, Any]:
-    """Return rl-zoo's table of algorithms with this repository's added, by zoo name."""
-    from rl_zoo3 import ALGOS
-
-    from benchmarks.reinforce import REINFORCE
-
-    zoo.register()
-    ALGOS.update(reinforce=REINFORCE)
-    return ALGOS
-
-
 def resolve(
     algo: str, env_id: str, overrides: Mapping[str, Any], *, defaults: bool = False
 ) -> tuple[str, dict[str, Any]]:
@@ -198,13 +167,13 @@ def parse_setting(setting: str) -> dict[str, Any]:
         The text is not a list of ``key=value``.
     """
     source = f"dict({setting})"
+    message = f"setting={setting!r} is not allowed, must be key=value,..."
     try:
         call = ast.parse(source, mode="eval").body
     except SyntaxError as error:
-        raise ValueError(f"setting={setting!r} is not allowed, must be key=value,...") from error
-    assert isinstance(call, ast.Call)  # by the parentheses
-    if call.args or any(keyword.arg is None for keyword in call.keywords):
-        raise ValueError(f"setting={setting!r} is not allowed, must be key=value,...")
+        raise ValueError(message) from error
+    if not isinstance(call, ast.Call) or call.args or not all(k.arg for k in call.keywords):
+        raise ValueError(message)
     parsed = {}
     for keyword in call.keywords:
         text = ast.get_source_segment(source, keyword.value)
@@ -249,7 +218,14 @@ def _compact(value: object) -> str:
 @cache
 def _signature(zoo_name: str) -> dict[str, Any]:
     """Return the constructor's arguments that have a default."""
-    arguments = inspect.signature(register_algorithms()[zoo_name]).parameters.values()
+    from sb3_contrib import TRPO
+    from stable_baselines3 import A2C, PPO
+
+    from benchmarks.reinforce import REINFORCE
+
+    # not rl-zoo's table: importing rl_zoo3 patches gymnasium, which is left to the workers
+    classes = {"a2c": A2C, "ppo": PPO, "trpo": TRPO, "reinforce": REINFORCE, **zoo.ALGORITHMS}
+    arguments = inspect.signature(classes[zoo_name]).parameters.values()
     return {a.name: a.default for a in arguments if a.default is not a.empty}
 
 

@@ -8,7 +8,7 @@ are; every environment weighs the same here, however many seeds it has.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,20 +18,19 @@ CONFIDENCE = 0.95
 N_RESAMPLES = 2000
 
 Array = npt.NDArray[np.float64]
-Value = TypeVar("Value", float, Array)
 
 
-class Estimate(NamedTuple, Generic[Value]):
-    """A statistic and the bounds of its interval."""
+class Estimate(NamedTuple):
+    """A statistic, a float or an array, and the bounds of its interval."""
 
-    value: Value
-    low: Value
-    high: Value
+    value: Any
+    low: Any
+    high: Any
 
 
 def bootstrap(
     values: Array, statistic: Callable[..., float] = np.mean, method: str = "BCa"
-) -> Estimate[float]:
+) -> Estimate:
     """Return a statistic of independent runs with its bootstrap interval.
 
     One run alone has none (NaN); equal ones have one of width 0.
@@ -53,8 +52,8 @@ def bootstrap(
 
 
 def stratified_bootstrap(
-    samples: Sequence[Array], statistic: Callable[[Sequence[Array]], Value]
-) -> Estimate[Value]:
+    samples: Sequence[Array], statistic: Callable[[Sequence[Array]], float | Array]
+) -> Estimate:
     """Return a statistic with percentile bounds; seeds are resampled within each environment.
 
     What the scores were normalised by is taken as known, as in rliable.
@@ -100,7 +99,7 @@ def probability_of_improvement(samples: Sequence[Array], others: Sequence[Array]
     return float(np.mean([(1 + signs.mean()) / 2 for signs in pairs]))
 
 
-def improvement(samples: Sequence[Array], others: Sequence[Array]) -> Estimate[float]:
+def improvement(samples: Sequence[Array], others: Sequence[Array]) -> Estimate:
     """Return the probability of improvement; both sides are resampled."""
     n = len(samples)
     return stratified_bootstrap(

@@ -20,6 +20,7 @@ RUN_COLUMNS = (
     *KEYS,
     "mean_return",
     "final_return",
+    "steps",
     "episodes",
     "wall_seconds",
     "cpu_seconds",

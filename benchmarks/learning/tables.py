@@ -46,8 +46,11 @@ def aggregate_table(comparison: Comparison) -> str:
         scores = comparison.scores(labels, tasks, metric)
         means = [stratified_bootstrap(scores[label], interquartile_mean) for label in labels]
         columns.append([f"IQM, {name}", *map(_cell, means)])
-        better = [improvement(scores[label], scores[baseline]) for label in labels]
-        columns.append([f"P(better than {baseline}), {name}", *map(_cell, better)])
+        better = [
+            "-" if label == baseline else _cell(improvement(scores[label], scores[baseline]))
+            for label in labels
+        ]
+        columns.append([f"P(better than {baseline}), {name}", *better])
     rows = zip(["algorithm", *labels], *columns, strict=True)
     text = (
         f"Scores are (return - random) / ({baseline} - random): the random policy is 0, "
@@ -134,7 +137,7 @@ def mean_cell(values: Array, digits: int | None = None) -> str:
     return _cell(estimate, digits)
 
 
-def _cell(estimate: Estimate[float], digits: int = 2) -> str:
+def _cell(estimate: Estimate, digits: int = 2) -> str:
     value, low, high = (f"{number:,.{digits}f}" for number in estimate)
     return value if np.isnan(estimate.low) else f"{value} [{low}, {high}]"
 
