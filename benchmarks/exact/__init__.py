@@ -1,5 +1,6 @@
 """Small decision processes whose J(θ), ∇J(θ) and ∇²J(θ) are known exactly, to be simulated too."""
 
+from benchmarks.exact.causal import expected_causal_hessian
 from benchmarks.exact.env import TabularEnv, TabularVectorEnv
 from benchmarks.exact.lipschitz import lipschitz_constants
 from benchmarks.exact.mdp import TabularMDP, coordination_mdp, random_mdp
@@ -12,6 +13,7 @@ __all__ = [
     "actor_vector",
     "assign_actor",
     "coordination_mdp",
+    "expected_causal_hessian",
     "lipschitz_constants",
     "random_mdp",
 ]

@@ -131,16 +131,19 @@ def random_mdp(
     n_observations: int | None = None,
     horizon: int = 5,
     gamma: float = 0.9,
+    concentration: float = 1.0,
 ) -> TabularMDP:
-    """Draw Dirichlet(1) dynamics and rewards uniform in [-1, 1].
+    """Draw an MDP with rewards uniform in [-1, 1].
 
-    States are spread over the observations in turn; by default each has its own.
+    Transitions are Dirichlet(``concentration``): the smaller, the more nearly deterministic. States
+    are spread over the observations in turn; by default each has its own.
     """
     rng = np.random.default_rng(seed)
     n_observations = n_states if n_observations is None else n_observations
+    weights = np.full(n_states, concentration)
     return TabularMDP(
         initial=torch.from_numpy(rng.dirichlet(np.ones(n_states))),
-        transition=torch.from_numpy(rng.dirichlet(np.ones(n_states), (n_states, n_actions))),
+        transition=torch.from_numpy(rng.dirichlet(weights, (n_states, n_actions))),
         reward=torch.from_numpy(rng.uniform(-1.0, 1.0, (n_states, n_actions))),
         observation=torch.arange(n_states) % n_observations,
         horizon=horizon,
