@@ -7,7 +7,7 @@ import fcntl
 import io
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import pandas as pd
 
@@ -34,12 +34,11 @@ CURVE_COLUMNS = (*KEYS, "steps", "return")
 def append(folder: Path, run: Run, result: Result) -> None:
     """Store a finished run: its curve, then the row that makes it count as done."""
     folder.mkdir(parents=True, exist_ok=True)
-    key = [getattr(run, name) for name in KEYS]
-    points = ([*key, steps, _short(value)] for steps, value in result.curve)
+    key = {name: getattr(run, name) for name in KEYS}
+    points = [{**key, "steps": steps, "return": value} for steps, value in result.curve]
     _append_rows(folder / "curves.csv", CURVE_COLUMNS, points)
-    row = {**dict(zip(KEYS, key, strict=True)), **result.row}
-    row.update(entry=run.entry, hyperparameters=run.hyperparameters)
-    _append_rows(folder / "runs.csv", RUN_COLUMNS, [[_short(row[name]) for name in RUN_COLUMNS]])
+    names = {"entry": run.entry, "hyperparameters": run.hyperparameters}
+    _append_rows(folder / "runs.csv", RUN_COLUMNS, [{**key, **result.row, **names}])
 
 
 def read_runs(folder: Path) -> pd.DataFrame:
@@ -60,21 +59,21 @@ def _read(path: Path, columns: Sequence[str], keys: list[str]) -> pd.DataFrame:
     return frame.drop_duplicates(keys, keep="last", ignore_index=True)
 
 
-def _append_rows(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Append all rows in one write, so that a run that is stopped leaves none or all of them."""
-    with path.open("a", newline="") as file:
+def _append_rows(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]]) -> None:
+    """Append all rows in one write, so that a run that is stopped leaves none or all of them.
+
+    A file made by another version keeps its columns.
+    """
+    with path.open("a+", newline="") as file:
         fcntl.flock(file, fcntl.LOCK_EX)  # until it is closed
+        file.seek(0)
+        header = next(csv.reader(file), None)
         text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        if _is_empty(file):
-            writer.writerow(columns)
-        writer.writerows(rows)
+        writer = csv.DictWriter(text, header or columns, extrasaction="ignore", lineterminator="\n")
+        if header is None:
+            writer.writeheader()
+        writer.writerows({key: _short(value) for key, value in row.items()} for row in rows)
         file.write(text.getvalue())
-
-
-def _is_empty(file: TextIO) -> bool:
-    file.seek(0, io.SEEK_END)
-    return file.tell() == 0
 
 
 def _short(value: Any) -> Any:

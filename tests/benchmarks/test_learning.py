@@ -259,3 +259,12 @@ def test_curves_hold_missing_points_as_nan(tmp_path: Path) -> None:
     store.append(tmp_path, _run("CRPN", 0), _result(1.0, np.array([np.nan, 1.0])))
     assert store.read_curves(tmp_path)["return"].isna().tolist() == [True, False]
     assert isinstance(store.read_runs(tmp_path), pd.DataFrame)
+
+
+def test_file_of_another_version_keeps_its_columns(tmp_path: Path) -> None:
+    (tmp_path / "runs.csv").write_text(",".join([*store.KEYS, "entry", "hyperparameters"]) + "\n")
+    store.append(tmp_path, _run("CRPN", 3), _result(1.0, np.array([1.0])))
+    runs = store.read_runs(tmp_path)
+    assert list(runs) == [*store.KEYS, "entry", "hyperparameters"]
+    assert runs.seed.tolist() == [3]
+    assert runs.hyperparameters.tolist() == ["a=1"]
