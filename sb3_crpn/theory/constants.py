@@ -97,7 +97,10 @@ class Constants:
 
     @property
     def G_H(self) -> float:  # noqa: N802
-        """‖one episode's estimate of ∇²J‖ ≤ K (H G² + L_1) S_1 ("trajectory", symmetrised)."""
+        """‖one episode's estimate of ∇²J‖ ≤ K (H G² + L_1) S_1.
+
+        Of "trajectory", symmetrised, and of "causal" at κ = 1: K (G² S_2 + L_1 S_1) is no larger.
+        """
         return self.K * (self.H * self.scores.G**2 + self.scores.L_1) * self._moment(1)
 
     @property

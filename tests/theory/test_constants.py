@@ -73,28 +73,26 @@ def test_bounds_of_the_cost_are_not_far_off_for_a_bandit():
     assert max(changes) > 0.13 * constants.L_H
 
 
-def episode_estimates(policy, actor, batch):
-    """The gradient [E, d] and the Hessian [E, d, d] of each episode, by the paper's estimator."""
+def episode_estimates(policy, actor, batch, estimator="trajectory"):
+    """The gradient [E, d] and the Hessian [E, d, d] of each episode."""
     eye = torch.eye(len(actor), dtype=torch.float64)
     gradients, hessians = [], []
     for episode in range(batch.n_episodes):
-        group = EpisodeGroup(
-            policy, actor, batch.take(np.array([episode])), PairWeights("trajectory")
-        )
+        group = EpisodeGroup(policy, actor, batch.take(np.array([episode])), PairWeights(estimator))
         gradients.append(group.gradient())
         hessians.append(torch.stack([group.hessian_product(v) for v in eye]))
     return torch.stack(gradients), torch.stack(hessians)
 
 
-@pytest.mark.parametrize("fixed_length", [True, False])
-def test_estimates_of_single_episodes_hold(fixed_length):
-    mdp = random_mdp(1, horizon=3, fixed_length=fixed_length)
+@pytest.mark.parametrize("estimator", ["trajectory", "causal"])
+def test_estimates_of_single_episodes_hold(estimator):
+    mdp = random_mdp(1, horizon=3, fixed_length=True)
     model, constants = tabular_crpn(mdp), constants_of(mdp)
     for scale in (0.3, 3.0):
         theta = scale * random_parameters(mdp)
         model.actor.assign(theta)
         batch = model._episode_batch(model._collect_fresh(24, None))
-        gradients, hessians = episode_estimates(model.policy, model.actor, batch)
+        gradients, hessians = episode_estimates(model.policy, model.actor, batch, estimator)
         theta = model.actor.vector
         assert float(gradients.norm(dim=1).max()) <= constants.G_g
         assert max(map(norm, hessians)) <= constants.G_H

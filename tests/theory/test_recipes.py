@@ -39,6 +39,9 @@ class Coordination(Constants):
     L_H = 0.71
     differences = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]])
 
+    def cost(self, theta):
+        return -np.prod(np.tanh(self.differences @ theta / 2.0))
+
     def derivatives(self, theta):
         t = np.tanh(self.differences @ theta / 2.0)
         slope = (1.0 - t**2) / 2.0
