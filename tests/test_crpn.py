@@ -113,6 +113,17 @@ def test_fixed_alpha_follows_its_schedule(algorithm, metric):
         np.testing.assert_allclose(log["multiplier"], halves, rtol=1e-6)
 
 
+@both
+def test_schedules_end_where_whole_episodes_overrun_the_last_timestep(algorithm):
+    """40 steps an update: the last one ends at -1 of the progress."""
+    log = TrainLog()
+    env = Drift(bound=np.inf, limit=10)
+    linear = {"alpha": lambda progress: 1.0 + progress, "learning_rate": lambda progress: progress}
+    make(algorithm, env, n_episodes=4, target_kl=None, **linear).learn(20, log)
+    assert log["alpha"] == [1.0]
+    assert log["learning_rate"] == [0.0]
+
+
 class Batches:
     """Records the batches that curvature is estimated from."""
 

@@ -84,6 +84,11 @@ class PolicyNewtonUpdate(EpisodeCollection):
         batch = self._episode_batch(self._collect_fresh(n_episodes, env))
         return estimate_curvature(self.policy, self.actor, batch, batch, self._pair_weights)
 
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        """Keep the progress of schedules in [0, 1]: whole episodes overrun the last timestep."""
+        super()._update_current_progress_remaining(num_timesteps, total_timesteps)
+        self._current_progress_remaining = max(0.0, self._current_progress_remaining)
+
     @property
     def _pair_weights(self) -> PairWeights:
         return PairWeights(self.hessian_estimator, self.hessian_lambda)
