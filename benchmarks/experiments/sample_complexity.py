@@ -1,0 +1,158 @@
+"""How many episodes it takes to reach an ε-second-order stationary point, as a function of ε.
+
+    python -m benchmarks.experiments.sample_complexity
+
+An ε-SOSP has ‖∇J‖ ≤ ε and λ_min(∇²J) ≥ -√(L_H ε); whether θ is one is decided after each update by
+the exact derivatives, on which no episode is spent.
+
+Batches scale as the theory has it, m = 8/ε² episodes for the gradient and b = 8/ε for the Hessian,
+with a practical constant: one episode's gradient has a variance of 2 at the saddle of the
+coordination MDP, so that the error of g is ε/2, where the provable recipe asks for (3/64) ε and
+bounds that variance by its worst case. CRPN has the settings of PAPER and the recipe's α = 3 L_H;
+REINFORCE steps by 1/L from m episodes. Both constants are those of the very problem.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from benchmarks.exact import TabularMDP, coordination_mdp, random_mdp
+from benchmarks.experiments.learners import make_learner, run_until
+from benchmarks.experiments.study import PALETTE, Row, Study, interval
+
+BATCH_CONSTANT = 8
+MAX_UPDATES = 1000
+# The exponent that each algorithm's theory bounds the episodes by
+BOUNDS = {"CRPN, paper": -3.5, "REINFORCE": -4.0}
+COLOURS = dict(zip(BOUNDS, PALETTE, strict=False))
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Where to start, with ``lipschitz_constants(mdp)``, and the ε to reach."""
+
+    title: str
+    mdp: TabularMDP
+    theta: tuple[float, ...]
+    L: float
+    L_H: float
+    epsilons: tuple[float, ...]
+
+
+PROBLEMS = {
+    "plateau": Problem(
+        "coordination, from the saddle: optimum at infinity",
+        coordination_mdp(),
+        theta=(0.0,) * 6,
+        L=1.5,
+        L_H=2.65,
+        epsilons=(0.4, 0.2, 0.1, 0.05, 0.02),
+    ),
+    # Four states that all look alike: the best policy is random, p = (0.683, 0.317)
+    "interior": Problem(
+        "blind agent, from p = (0.05, 0.95): optimum inside",
+        random_mdp(26, n_states=4, n_observations=1, horizon=4, gamma=1.0),
+        theta=(0.0, 0.0, -1.5, 1.5),
+        L=0.411,
+        L_H=0.972,
+        epsilons=(0.1, 0.05, 0.02, 0.01),
+    ),
+}
+
+
+def jobs(seeds: int) -> list[Row]:
+    """Return what to run, the cheap accuracies first."""
+    runs = [
+        {"problem": name, "algorithm": algorithm, "epsilon": epsilon, "seed": seed}
+        for seed in range(seeds)
+        for name, problem in PROBLEMS.items()
+        for algorithm in BOUNDS
+        for epsilon in problem.epsilons
+    ]
+    return sorted(runs, key=lambda run: -run["epsilon"])
+
+
+def measure(problem: str, algorithm: str, epsilon: float, seed: int) -> list[Row]:
+    """Train until θ is an ε-SOSP."""
+    chosen = PROBLEMS[problem]
+    m, b = math.ceil(BATCH_CONSTANT / epsilon**2), math.ceil(BATCH_CONSTANT / epsilon)
+    arguments = (
+        {"actor_learning_rate": 1 / chosen.L}
+        if algorithm == "REINFORCE"
+        else {"alpha": 3 * chosen.L_H, "n_episodes": m, "n_hessian_episodes": b}
+    )
+    theta = torch.tensor(chosen.theta, dtype=torch.float64)
+    model = make_learner(algorithm, chosen.mdp, max(m, b), theta, seed, **arguments)
+    until = run_until(
+        model, lambda theta: chosen.mdp.is_sosp(theta, epsilon, chosen.L_H), MAX_UPDATES
+    )
+    if not until.met:
+        raise RuntimeError(f"no {epsilon}-SOSP within {MAX_UPDATES} updates: {until.theta}")
+    return [{"updates": until.n_updates, "episodes": until.n_updates * max(m, b)}]
+
+
+def draw(rows: pd.DataFrame) -> Figure:
+    """Draw episodes against ε for each problem and print the slopes."""
+    print("| problem | algorithm | slope of episodes | of updates | of the smaller half | bound |")
+    print("|---|---|---|---|---|---|")
+    figure, axes = plt.subplots(1, len(PROBLEMS), figsize=(9, 3.8), layout="constrained")
+    for axis, (name, problem) in zip(axes, PROBLEMS.items(), strict=True):
+        for algorithm, bound in BOUNDS.items():
+            chosen = rows[(rows.problem == name) & (rows.algorithm == algorithm)]
+            episodes = chosen.pivot_table(index="seed", columns="epsilon", values="episodes")
+            slopes = interval_of_slopes(episodes)
+            cells = [
+                slopes,
+                interval_of_slopes(episodes * episodes.columns.to_numpy() ** 2),
+                interval_of_slopes(episodes.iloc[:, : (episodes.shape[1] + 1) // 2 + 1]),
+            ]
+            texts = ["{:.2f} [{:.2f}, {:.2f}]".format(*cell) for cell in cells]
+            print(f"| {name} | {algorithm} | {' | '.join(texts)} | {bound:g} |")
+            _draw_fit(axis, algorithm, episodes, slopes, bound)
+        axis.set(xscale="log", yscale="log", xlabel="ε", ylabel="episodes to an ε-SOSP")
+        axis.set_xticks(problem.epsilons, [f"{epsilon:g}" for epsilon in problem.epsilons])
+        axis.minorticks_off()
+        axis.set_title(problem.title, fontsize=9)
+        axis.invert_xaxis()
+        axis.legend(loc="upper left")
+    return figure
+
+
+def interval_of_slopes(episodes: pd.DataFrame) -> tuple[float, float, float]:
+    """Return the mean over seeds of the slope of log episodes [seeds, ε] in log ε, an interval."""
+    x = np.log(episodes.columns.to_numpy(dtype=float))
+    slopes = np.polyfit(x, np.log(episodes.to_numpy(dtype=float)).T, 1)[0]
+    return interval(slopes, statistic=np.mean)
+
+
+def _draw_fit(
+    axis: Axes,
+    algorithm: str,
+    episodes: pd.DataFrame,
+    slopes: tuple[float, float, float],
+    bound: float,
+) -> None:
+    epsilons: NDArray[np.float64] = episodes.columns.to_numpy(dtype=float)
+    bands = np.array([interval(episodes[epsilon]) for epsilon in episodes.columns])
+    middle, low, high = bands.T
+    colour = COLOURS[algorithm]
+    label = "{}: slope {:.2f} [{:.2f}, {:.2f}]".format(algorithm, *slopes)
+    axis.plot(epsilons, middle, "o-", ms=4, color=colour, label=label)
+    axis.fill_between(epsilons, low, high, color=colour, alpha=0.2, lw=0)
+    reference = middle[-1] * (epsilons / epsilons[-1]) ** bound
+    axis.plot(epsilons, reference, ":", color=colour, lw=1, label=f"bound: $ε^{{{bound:g}}}$")
+
+
+STUDY = Study("sample_complexity", jobs, measure, draw, seeds=10)
+
+if __name__ == "__main__":
+    STUDY.main(str(__doc__))
