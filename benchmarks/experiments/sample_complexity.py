@@ -10,6 +10,9 @@ with a practical constant: one episode's gradient has a variance of 2 at the sad
 coordination MDP, so that the error of g is ε/2, where the provable recipe asks for (3/64) ε and
 bounds that variance by its worst case. CRPN has the settings of PAPER and the recipe's α = 3 L_H;
 REINFORCE steps by 1/L from m episodes. Both constants are those of the very problem.
+
+The same steps with the exact gradient and Hessian in place of estimates, m episodes counted for
+each, show where the slopes tend to for ε beyond reach of simulation.
 """
 
 from __future__ import annotations
@@ -28,9 +31,11 @@ from numpy.typing import NDArray
 from benchmarks.exact import TabularMDP, coordination_mdp, random_mdp
 from benchmarks.experiments.learners import make_learner, run_until
 from benchmarks.experiments.study import PALETTE, Row, Study, interval
+from sb3_crpn.cubic import solve_dense
 
 BATCH_CONSTANT = 8
 MAX_UPDATES = 1000
+EXACT_EPSILONS = (0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
 # The exponent that each algorithm's theory bounds the episodes by
 BOUNDS = {"CRPN, paper": -3.5, "REINFORCE": -4.0}
 COLOURS = dict(zip(BOUNDS, PALETTE, strict=False))
@@ -46,6 +51,11 @@ class Problem:
     L: float
     L_H: float
     epsilons: tuple[float, ...]
+
+    @property
+    def start(self) -> torch.Tensor:
+        """θ_0, [d]."""
+        return torch.tensor(self.theta, dtype=torch.float64)
 
 
 PROBLEMS = {
@@ -90,8 +100,7 @@ def measure(problem: str, algorithm: str, epsilon: float, seed: int) -> list[Row
         if algorithm == "REINFORCE"
         else {"alpha": 3 * chosen.L_H, "n_episodes": m, "n_hessian_episodes": b}
     )
-    theta = torch.tensor(chosen.theta, dtype=torch.float64)
-    model = make_learner(algorithm, chosen.mdp, max(m, b), theta, seed, **arguments)
+    model = make_learner(algorithm, chosen.mdp, max(m, b), chosen.start, seed, **arguments)
     until = run_until(
         model, lambda theta: chosen.mdp.is_sosp(theta, epsilon, chosen.L_H), MAX_UPDATES
     )
@@ -100,30 +109,49 @@ def measure(problem: str, algorithm: str, epsilon: float, seed: int) -> list[Row
     return [{"updates": until.n_updates, "episodes": until.n_updates * max(m, b)}]
 
 
+def exact_updates(problem: Problem, algorithm: str) -> list[int]:
+    """Return how many noiseless updates reach an ε-SOSP, for each of ``EXACT_EPSILONS``."""
+    mdp, theta = problem.mdp, problem.start
+    if not mdp.gradient(theta).any():  # gradient steps alone would stay on the saddle
+        theta = theta + 1e-3 * torch.linalg.eigh(mdp.hessian(theta)).eigenvectors[:, 0]
+    n_updates, counts = 0, []
+    for epsilon in EXACT_EPSILONS:
+        while not mdp.is_sosp(theta, epsilon, problem.L_H):
+            gradient = mdp.gradient(theta)
+            if algorithm == "REINFORCE":
+                theta = theta - gradient / problem.L
+            else:
+                theta = theta + solve_dense(gradient, mdp.hessian(theta), 3 * problem.L_H).step
+            n_updates += 1
+        counts.append(n_updates)
+    return counts
+
+
 def draw(rows: pd.DataFrame) -> Figure:
     """Draw episodes against ε for each problem and print the slopes."""
-    print("| problem | algorithm | slope of episodes | of updates | of the smaller half | bound |")
-    print("|---|---|---|---|---|---|")
+    print("| problem | algorithm | slope of episodes | of updates | exact, ε ≤ 0.005 | bound |")
+    print("|---" * 6 + "|")
     figure, axes = plt.subplots(1, len(PROBLEMS), figsize=(9, 3.8), layout="constrained")
     for axis, (name, problem) in zip(axes, PROBLEMS.items(), strict=True):
         for algorithm, bound in BOUNDS.items():
             chosen = rows[(rows.problem == name) & (rows.algorithm == algorithm)]
             episodes = chosen.pivot_table(index="seed", columns="epsilon", values="episodes")
             slopes = interval_of_slopes(episodes)
-            cells = [
-                slopes,
-                interval_of_slopes(episodes * episodes.columns.to_numpy() ** 2),
-                interval_of_slopes(episodes.iloc[:, : (episodes.shape[1] + 1) // 2 + 1]),
-            ]
-            texts = ["{:.2f} [{:.2f}, {:.2f}]".format(*cell) for cell in cells]
-            print(f"| {name} | {algorithm} | {' | '.join(texts)} | {bound:g} |")
+            of_updates = interval_of_slopes(episodes * episodes.columns.to_numpy() ** 2)
+            texts = ["{:.2f} [{:.2f}, {:.2f}]".format(*cell) for cell in (slopes, of_updates)]
+            exact = np.array(exact_updates(problem, algorithm)) / np.array(EXACT_EPSILONS) ** 2
+            limit = np.polyfit(np.log(EXACT_EPSILONS[-3:]), np.log(exact[-3:]), 1)[0]
+            print(f"| {name} | {algorithm} | {' | '.join(texts)} | {limit:.2f} | {bound:g} |")
+            axis.plot(EXACT_EPSILONS, BATCH_CONSTANT * exact, "--", lw=1, color=COLOURS[algorithm])
             _draw_fit(axis, algorithm, episodes, slopes, bound)
+        axis.plot([], [], "--", lw=1, color="0.4", label="exact derivatives")
         axis.set(xscale="log", yscale="log", xlabel="ε", ylabel="episodes to an ε-SOSP")
-        axis.set_xticks(problem.epsilons, [f"{epsilon:g}" for epsilon in problem.epsilons])
+        ticks = sorted({*problem.epsilons, *EXACT_EPSILONS})
+        axis.set_xticks(ticks, [f"{epsilon:g}" for epsilon in ticks], fontsize=7)
         axis.minorticks_off()
         axis.set_title(problem.title, fontsize=9)
         axis.invert_xaxis()
-        axis.legend(loc="upper left")
+        axis.legend(loc="lower right", fontsize=7)
     return figure
 
 
