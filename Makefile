@@ -31,7 +31,8 @@ format: venv
 
 # The versions that the tests passed with; "+cpu" names a build, not a version
 lock: venv
-	$(BIN)/pip freeze --exclude-editable | sed 's/+cpu//' > constraints.txt
+	echo '# The versions that the tests passed with (Python 3.11); made by `make lock`' > constraints.txt
+	$(BIN)/pip freeze --all --exclude pip --exclude-editable | sed 's/+cpu//' >> constraints.txt
 
 clean:
 	rm -rf $(VENV) runs dist .mypy_cache .ruff_cache .pytest_cache .hypothesis

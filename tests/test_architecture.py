@@ -36,7 +36,7 @@ THIRD_PARTY = {
     "parameters": {"torch"},
     "distributed": {"torch"},
     "theory": set(),
-    "zoo": {*ARRAYS, *SB3, "rl_zoo3"},
+    "zoo": {*ARRAYS, *SB3, "rl_zoo3", "optuna"},
 }
 
 

@@ -1,0 +1,123 @@
+"""rl-zoo's command line with CRPN and ACRPN.
+
+``python -m sb3_crpn.zoo train --algo crpn --env CartPole-v1`` runs rl_zoo3's own script, with its
+own options, after both algorithms have joined rl_zoo3's registries. rl_zoo3 is imported only then:
+it is optional, and it patches Gymnasium's ``TimeLimit``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_crpn import ACRPN, CRPN
+
+if TYPE_CHECKING:
+    from optuna import Trial
+
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"crpn": CRPN, "acrpn": ACRPN}
+SCRIPTS = ("train", "enjoy", "plot_train", "all_plots", "plot_from_file")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one of rl_zoo3's scripts, named by the first of the command line's ``arguments``.
+
+    Raises
+    ------
+    SystemExit
+        The arguments are wrong, or rl_zoo3 or what it needs is not installed.
+    """
+    parser = argparse.ArgumentParser(
+        prog="sb3-crpn", description="rl-zoo's scripts with CRPN and ACRPN."
+    )
+    parser.add_argument("script", choices=SCRIPTS, help="its own options follow; see SCRIPT --help")
+    parser.add_argument("options", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
+    parsed = parser.parse_args(arguments)
+    try:
+        import rl_zoo3.cli
+    except ModuleNotFoundError as error:
+        sys.exit(f'sb3-crpn: {error}; install the extra: pip install "sb3-crpn[zoo]"')
+    register()
+    config = _default_config(parsed.options) if parsed.script == "train" else []
+    sys.argv = ["sb3-crpn", parsed.script, *config, *parsed.options]
+    rl_zoo3.cli.main()
+
+
+def register() -> None:
+    """Add both algorithms to rl_zoo3's registries: class, Optuna sampler, converter."""
+    from rl_zoo3.hyperparams_opt import (
+        HYPERPARAMS_CONVERTER,
+        HYPERPARAMS_SAMPLER,
+        convert_onpolicy_params,
+    )
+    from rl_zoo3.utils import ALGOS
+
+    # in place: rl_zoo3's modules have imported these very dicts by name
+    ALGOS.update(ALGORITHMS)
+    HYPERPARAMS_SAMPLER.update(crpn=sample_crpn_params, acrpn=sample_acrpn_params)
+    HYPERPARAMS_CONVERTER.update(dict.fromkeys(ALGORITHMS, convert_onpolicy_params))
+
+
+def config_file(name: str) -> Path:
+    """Return the path of ``zoo_configs/NAME.yml``: crpn, acrpn, crpn_paper or acrpn_paper."""
+    installed = Path(str(resources.files("sb3_crpn"))) / "zoo_configs"
+    folder = installed if installed.is_dir() else installed.parents[1] / "zoo_configs"
+    return folder / f"{name}.yml"
+
+
+def _default_config(options: Sequence[str]) -> list[str]:
+    """Return the option that names our hyperparameters; a later one of the user's own wins."""
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--algo")
+    algo = parser.parse_known_args(options)[0].algo
+    return ["--conf-file", str(config_file(algo))] if algo in ALGORITHMS else []
+
+
+def sample_crpn_params(
+    trial: Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
+) -> dict[str, Any]:
+    """Draw CRPN's hyperparameters for a trial of rl_zoo3's search, as constructor arguments."""
+    return _sample(trial)
+
+
+def sample_acrpn_params(
+    trial: Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
+) -> dict[str, Any]:
+    """Draw ACRPN's hyperparameters: those of CRPN and N̂."""
+    return _sample(trial) | {
+        "subsolver_steps": trial.suggest_int("subsolver_steps", 10, 200, log=True)
+    }
+
+
+def _sample(trial: Trial) -> dict[str, Any]:
+    """Draw what both algorithms share, under the names and in the ranges of rl_zoo3's samplers."""
+    from rl_zoo3.hyperparams_opt import convert_onpolicy_params
+
+    sampled = {
+        "n_steps_pow": trial.suggest_int("n_steps_pow", 8, 12),
+        "batch_size_pow": trial.suggest_int("batch_size_pow", 5, 9),
+        "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.0001, 0.03, log=True),
+        "one_minus_gae_lambda": trial.suggest_float("one_minus_gae_lambda", 0.0001, 0.1, log=True),
+        "learning_rate": trial.suggest_float("learning_rate", 1e-4, 1e-2, log=True),
+        "n_critic_updates": trial.suggest_int("n_critic_updates", 5, 30),
+        "target_kl": trial.suggest_float("target_kl", 0.001, 0.3, log=True),
+        "fisher_damping": trial.suggest_float("fisher_damping", 1e-3, 1.0, log=True),
+        "hessian_lambda": trial.suggest_float("hessian_lambda", 0.0, 1.0),
+        "krylov_dim": trial.suggest_int("krylov_dim", 5, 30),
+        "net_arch": trial.suggest_categorical("net_arch", ["small", "medium"]),
+        "activation_fn": trial.suggest_categorical("activation_fn", ["tanh", "relu"]),
+    }
+    converted: dict[str, Any] = convert_onpolicy_params(sampled)
+    for name in ("n_steps", "batch_size", "gamma", "gae_lambda"):
+        trial.set_user_attr(name, converted[name])  # the values behind powers and differences
+    return converted
+
+
+if __name__ == "__main__":
+    main()

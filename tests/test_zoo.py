@@ -1,0 +1,216 @@
+"""rl-zoo's scripts on CRPN and ACRPN: rl_zoo3 patches Gymnasium, so it runs in subprocesses."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import optuna
+import pytest
+import yaml
+from stable_baselines3.common.save_util import load_from_pkl
+
+from sb3_crpn.zoo import ALGORITHMS, _default_config, config_file, main
+
+ROOT = Path(__file__).parents[1]
+# Episodes of 200 steps: two environments take 400 to the update
+ENV = "Pendulum-v1"
+SMALL = "-params n_envs:2 n_steps:200 normalize:True gamma:0.9"
+# Runs several command lines with one import of rl_zoo3
+CHAIN = """
+import sys
+import sb3_crpn.zoo
+
+print(sb3_crpn.__file__)
+for line in sys.argv[1:]:
+    sb3_crpn.zoo.main(line.split())
+"""
+SHORT = (
+    f"train --algo {{}} --env {ENV} -params n_steps:200 -n 400 --eval-freq 200 --eval-episodes 2"
+)
+# A configuration in Python: rl_zoo3 reads schedules from YAML for the learning rate alone
+SCHEDULES = f"""
+from stable_baselines3.common.utils import LinearSchedule
+
+hyperparams = {{
+    "{ENV}": {{
+        "n_timesteps": 200,
+        "policy": "MlpPolicy",
+        "learning_rate": "lin_1e-3",
+        "alpha": LinearSchedule(100.0, 10.0, 1.0),
+        "n_episodes": LinearSchedule(1, 2, 1.0),
+        "target_kl": None,
+    }}
+}}
+"""
+
+
+def run(command, folder, **environment):
+    """Run ``command`` in ``folder``, away from the source tree, and return what it prints."""
+    variables = {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg", **environment}
+    done = subprocess.run(
+        command,
+        cwd=folder,
+        env=os.environ | variables,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout
+    return done.stdout
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_scripts_run_from_the_source_tree(algo, tmp_path):
+    # one test, so that one xdist worker makes the runs that the checks share
+    train = f"train --algo {algo} --env {ENV}"
+    enjoy = f"enjoy --algo {algo} --env {ENV} -f logs --no-render -n 200"
+    curves = "-n 800 --eval-freq 400 --eval-episodes 2"
+    search = "-optimize -n 200 --n-trials 1 --eval-episodes 1 --no-optim-plots"
+    study = "--storage study.log --study-name study"
+    (tmp_path / "config.py").write_text(SCHEDULES)
+    first = f"{train} {SMALL} {curves} --save-freq 400 --tensorboard-log tensorboard"
+    output = run([sys.executable, "-m", "sb3_crpn.zoo", *first.split()], tmp_path)
+    assert f"Loading hyperparameters from: {config_file(algo)}" in output
+    output = run(
+        [
+            *(sys.executable, "-c", CHAIN),
+            f"{train} {SMALL} {curves} -i logs/{algo}/{ENV}_1/{ENV}.zip",
+            f"{enjoy} --exp-id 1 --load-best",
+            f"{enjoy} --exp-id 1 --load-checkpoint 400",
+            f"plot_train -a {algo} -e {ENV} -f logs -w 2",
+            f"all_plots -a {algo} -e {ENV} -f logs -o results --no-display",
+            "plot_from_file -i results -o figure --format png",
+            f"{train} {search} {study} --seed 1",
+            f"{train} {search} {study} --seed 2",
+            f"{train} {study} -n 200 --trial-id 1",
+            f"{train} -n 200 --conf-file config.py",
+            f"{enjoy} --stochastic",
+        ],
+        tmp_path,
+    )
+    runs = {number: tmp_path / "logs" / algo / f"{ENV}_{number}" for number in (1, 2, 5, 6)}
+    check_training(algo, runs[1])
+    assert list(tmp_path.glob(f"tensorboard/{ENV}/*/events.out.tfevents.*"))
+    check_continuation(algo, runs[1], runs[2])
+    check_enjoy(algo, output)
+    assert (tmp_path / "figure").read_bytes().startswith(b"\x89PNG")
+    check_search(algo, tmp_path / "study.log", runs[5])
+    check_schedules(algo, runs[6])
+
+
+def load(algo, folder):
+    return ALGORITHMS[algo].load(folder / f"{ENV}.zip", device="cpu")
+
+
+def normalisation(folder):
+    """The statistics that VecNormalize saved with a run."""
+    return load_from_pkl(folder / ENV / "vecnormalize.pkl")
+
+
+def check_training(algo, folder):
+    """Models, checkpoints, statistics and learning curves of a run."""
+    models = {path.name for path in folder.glob("*.zip")}
+    checkpoints = {"rl_model_400_steps.zip", "rl_model_800_steps.zip"}
+    assert models == {f"{ENV}.zip", "best_model.zip", *checkpoints}
+    assert np.load(folder / "evaluations.npz")["timesteps"].tolist() == [400, 800]
+    assert len(list(folder.glob("*.monitor.csv"))) == 2
+    assert normalisation(folder).gamma == 0.9
+    assert load(algo, folder)._n_updates == 2
+
+
+def check_continuation(algo, first, second):
+    """A run that went on from the first's policy and statistics, for as long again."""
+    assert load(algo, second)._n_updates == 4
+    counts = [normalisation(folder).obs_rms.count for folder in (first, second)]
+    assert counts[1] == pytest.approx(2 * counts[0], rel=0.01)
+
+
+def check_enjoy(algo, output):
+    """The best model, a checkpoint and the last model, one episode each."""
+    for model in (f"{ENV}_1/best_model", f"{ENV}_1/rl_model_400_steps", f"{ENV}_6/{ENV}"):
+        assert f"Loading logs/{algo}/{model}.zip" in output
+    assert output.count("Loading running average") == 2
+    assert output.count("1 Episodes") == 3
+
+
+def check_search(algo, log, folder):
+    """Two trials, the second by a search that resumed the study, and a run of the second."""
+    backend = optuna.storages.journal.JournalFileBackend(str(log))
+    storage = optuna.storages.JournalStorage(backend)
+    first, second = optuna.load_study(study_name="study", storage=storage).trials
+    assert first.state == second.state == optuna.trial.TrialState.COMPLETE
+    assert first.params != second.params
+    used = yaml.load((folder / ENV / "config.yml").read_text(), Loader=yaml.UnsafeLoader)
+    sampled = second.params | second.user_attrs
+    assert {"n_steps", "gamma", "target_kl", "hessian_lambda"} <= used.keys() & sampled.keys()
+    assert all(used[name] == sampled[name] for name in used.keys() & sampled.keys())
+    assert ("subsolver_steps" in used) == (algo == "acrpn")
+
+
+def check_schedules(algo, folder):
+    """A run with the schedules of the configuration in Python."""
+    model = load(algo, folder)
+    assert (model.alpha(0.5), model.n_episodes(0.5)) == (55.0, 1.5)
+
+
+@pytest.fixture
+def site(tmp_path):
+    """The folder that a wheel, built from the source distribution, is installed in."""
+    run([sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", str(tmp_path)], ROOT)
+    (source,) = tmp_path.glob("*.tar.gz")
+    pip = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-index"]
+    run([*pip, "--no-build-isolation", "--target", str(tmp_path / "site"), str(source)], tmp_path)
+    return tmp_path / "site"
+
+
+def test_scripts_run_from_a_wheel(site, tmp_path):
+    path = {"PYTHONPATH": str(site)}
+    output = run(
+        [str(site / "bin" / "sb3-crpn"), *SHORT.format("crpn").split(), "--vec-env", "subproc"],
+        tmp_path,
+        **path,
+    )
+    assert f"Loading hyperparameters from: {site}/sb3_crpn/zoo_configs/crpn.yml" in output
+    search = "-optimize -n 200 --n-trials 1 --eval-episodes 1 --no-optim-plots"
+    lines = [SHORT.format("acrpn")]
+    for algo in ALGORITHMS:
+        common = f"--algo {algo} --env {ENV}"
+        lines += [f"enjoy {common} -f logs --no-render -n 200", f"train {common} {search}"]
+    lines.append(f"all_plots -a crpn acrpn -e {ENV} -f logs -o results --no-display")
+    output = run([sys.executable, "-c", CHAIN, *lines], tmp_path, **path)
+    assert output.startswith(f"{site}/sb3_crpn/__init__.py")
+    assert f"Loading hyperparameters from: {site}/sb3_crpn/zoo_configs/acrpn.yml" in output
+    assert output.count("1 Episodes") == output.count("Best trial:") == 2
+    assert (tmp_path / "results.pkl").stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ("--algo crpn --env CartPole-v1", "crpn"),
+        ("-n 5 --algo=acrpn", "acrpn"),
+        ("--algo ppo", None),
+        ("", None),
+    ],
+)
+def test_our_algorithms_have_our_hyperparameters(options, name):
+    expected = [] if name is None else ["--conf-file", str(ROOT / "zoo_configs" / f"{name}.yml")]
+    assert _default_config(options.split()) == expected
+
+
+def test_without_rl_zoo3_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "rl_zoo3", None)
+    with pytest.raises(SystemExit) as stop:
+        main(["train", "--algo", "crpn"])
+    assert 'pip install "sb3-crpn[zoo]"' in stop.value.code
+    assert "\n" not in stop.value.code
+
+
+def test_unknown_scripts_are_named(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["fly"])
+    assert stop.value.code == 2
+    assert "plot_from_file" in capsys.readouterr().err
