@@ -188,7 +188,7 @@ def _draw_kappas(axis: Axes, rows: pd.DataFrame) -> None:
         ]
         middle, low, high = np.array(bands).T
         best, gain = kappas[middle.argmin()], middle.min() / middle[-1]
-        print(f"m = {m}: best κ = {best:g}, error {gain:.2f} × that of κ = 1")
+        print(f"m = {m}: best κ = {best:g}, error {gain:.2f} of that of κ = 1")
         axis.plot(x, middle, "o-", ms=4, color=colour, label=f"m = {m} episodes")
         axis.fill_between(x, low, high, color=colour, alpha=0.15, lw=0)
         axis.plot(x[middle.argmin()], middle.min(), "*", ms=11, color=colour)
