@@ -101,8 +101,9 @@ def coordination_mdp(gamma: float = 1.0, noise: float = 0.0) -> TabularMDP:
     shared), the eigenvalues are -3γ/2, four times 0, and γ/2; for separate logits in each
     observation they would be ±γ/2. The infimum, J = -γ, lies at infinity.
 
-    At the saddle itself every single episode's estimate of ∇²J is exact. ``noise`` ends that: the
-    second reward is raised or lowered by it, both equally likely, whatever is done. J is the same.
+    At the saddle itself every single episode's estimate of ∇²J is exact. With ``noise`` it is
+    1 ± noise times ∇²J: the second reward is raised or lowered by it, both equally likely, whatever
+    is done. J is the same.
     """
     # states: the first step, then first action × sign of the noise
     reward = torch.zeros(5, 2, dtype=torch.float64)
