@@ -94,7 +94,7 @@ class EpisodeRolloutBuffer(RolloutBuffer):
             kept = rows[start : start + _CHUNK], envs[start : start + _CHUNK]
             with torch.no_grad():
                 values, log_probs, _ = policy.evaluate_actions(
-                    self._gather_observations(kept),  # type: ignore[arg-type]
+                    self._gather_observations(kept),
                     self._gather_actions(kept),
                 )
             self.values[kept] = values.flatten().cpu().numpy()
