@@ -1,14 +1,97 @@
-"""Sums and broadcasts over the ranks of ``torch.distributed``; the identity on one process."""
+"""One run on several processes: ranks, and sums and broadcasts over them.
+
+Without a process group of ``torch.distributed`` every function is the identity on one process.
+docs/DISTRIBUTED.md says how a run is started and what is shared.
+"""
 
 from __future__ import annotations
 
+import argparse
+import atexit
+import os
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from datetime import timedelta
+
+import numpy as np
+import numpy.typing as npt
 import torch
 import torch.distributed as dist
+
+# How long a rank waits for the others: longer than any evaluation that rank 0 makes alone. A rank
+# whose process ends is noticed at once.
+TIMEOUT = timedelta(minutes=30)
+
+_alone = False
+
+
+class RankError(RuntimeError):
+    """Another rank has ended, or does not answer."""
+
+
+def init_from_env(timeout: timedelta = TIMEOUT) -> None:
+    """Join the process group that ``torchrun`` describes in the environment, if it does.
+
+    Tensors on CPUs are reduced by gloo; tensors on GPUs by NCCL where each rank has a GPU of its
+    own, which becomes its current device, and by gloo where ranks share one.
+
+    Parameters
+    ----------
+    timeout
+        How long to wait for another rank before giving up with :class:`RankError`.
+    """
+    if dist.is_initialized() or int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        return
+    backend, n_gpus = "gloo", torch.cuda.device_count()
+    if n_gpus:
+        torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % n_gpus)
+        if int(os.environ.get("LOCAL_WORLD_SIZE", "1")) <= n_gpus:
+            backend = "cpu:gloo,cuda:nccl"
+    dist.init_process_group(backend, timeout=timeout)
+    atexit.register(_leave)
+
+
+def _leave() -> None:
+    if dist.is_initialized():
+        dist.destroy_process_group()
 
 
 def world_size() -> int:
     """Return the number of ranks, 1 without an initialised process group."""
-    return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
+    return dist.get_world_size() if _grouped() else 1
+
+
+def rank() -> int:
+    """Return this process's number, 0 … world_size - 1."""
+    return dist.get_rank() if _grouped() else 0
+
+
+def _grouped() -> bool:
+    return not _alone and dist.is_available() and dist.is_initialized()
+
+
+@contextmanager
+def alone() -> Iterator[None]:
+    """Let the block be a run of one process, for what one rank does while the others wait."""
+    global _alone
+    outer, _alone = _alone, True
+    try:
+        yield
+    finally:
+        _alone = outer
+
+
+@contextmanager
+def _waiting() -> Iterator[None]:
+    try:
+        yield
+    except RuntimeError as error:  # of whatever backend
+        raise RankError(
+            f"rank {rank()} of {world_size()} lost another rank, which ended or did not answer in "
+            f"time: its own output says why. Training ends; saved files are intact. {error}"
+        ) from error
 
 
 def all_sum(tensor: torch.Tensor) -> torch.Tensor:
@@ -18,18 +101,112 @@ def all_sum(tensor: torch.Tensor) -> torch.Tensor:
     ----------
     tensor
         Same shape and dtype on every rank; left unchanged.
+
+    Raises
+    ------
+    RankError
+        Another rank has ended, or does not answer; so does every function below.
     """
-    if world_size() == 1:
-        return tensor
-    total = tensor.clone()
-    dist.all_reduce(total)
-    return total
+    return tensor if world_size() == 1 else _reduce(tensor, dist.ReduceOp.SUM)
 
 
-def broadcast(tensor: torch.Tensor, source: int = 0) -> torch.Tensor:
-    """Return the ``tensor`` of rank ``source`` on every rank."""
+def all_max(value: float) -> float:
+    """Return the largest of the ranks' values, none of them nan."""
+    if world_size() == 1:
+        return value
+    return float(_reduce(torch.tensor(value, dtype=torch.float64), dist.ReduceOp.MAX))
+
+
+def _reduce(tensor: torch.Tensor, operation: dist.ReduceOp.RedOpType) -> torch.Tensor:
+    result = tensor.detach().clone(memory_format=torch.contiguous_format)
+    with _waiting():
+        dist.all_reduce(result, operation)
+    return result
+
+
+def broadcast(tensor: torch.Tensor) -> torch.Tensor:
+    """Return the ``tensor`` of rank 0 on every rank."""
     if world_size() == 1:
         return tensor
-    copy = tensor.clone()
-    dist.broadcast(copy, source)
+    copy = tensor.detach().clone(memory_format=torch.contiguous_format)
+    with _waiting():
+        dist.broadcast(copy, 0)
     return copy
+
+
+def broadcast_state(module: torch.nn.Module) -> None:
+    """Give the parameters and buffers of ``module`` the bits of rank 0, one message per dtype."""
+    if world_size() == 1:
+        return
+    tensors = [*module.parameters(), *module.buffers()]
+    for dtype in dict.fromkeys(tensor.dtype for tensor in tensors):
+        alike = [tensor for tensor in tensors if tensor.dtype == dtype]
+        flat = broadcast(torch.cat([tensor.detach().reshape(-1) for tensor in alike]))
+        pieces = torch.split(flat, [tensor.numel() for tensor in alike])
+        with torch.no_grad():
+            for tensor, piece in zip(alike, pieces, strict=True):
+                tensor.copy_(piece.view_as(tensor))
+
+
+def gather_counts(count: int) -> list[int]:
+    """Return the counts of all ranks, in their order."""
+    counts = torch.zeros(world_size(), dtype=torch.int64)
+    counts[rank()] = count
+    return [int(number) for number in all_sum(counts)]
+
+
+def mean_and_variance(values: npt.NDArray[np.float64]) -> tuple[float, float]:
+    """Return mean and variance (of the population) of the union of the ranks' arrays [n]."""
+    count, total = all_sum(torch.tensor([len(values), values.sum()], dtype=torch.float64)).tolist()
+    mean = total / count
+    squares = torch.tensor(((values - mean) ** 2).sum(), dtype=torch.float64)
+    return mean, all_sum(squares).item() / count
+
+
+def share(number: int) -> int:
+    """Return this rank's part of ``number`` things that are dealt out evenly."""
+    return number // world_size() + (rank() < number % world_size())
+
+
+def rank_seed(seed: int, *more: int) -> int:
+    """Return the seed of this rank, in [0, 2^32): on rank 0 ``seed``, else a hash.
+
+    The hash is of ``seed``, the rank and ``more`` numbers (NumPy's ``SeedSequence``), so that
+    runs with the same seed and number of ranks repeat each other.
+    """
+    if rank() == 0:
+        return seed
+    return int(np.random.SeedSequence((seed, rank(), *more)).generate_state(1)[0])
+
+
+def zoo_options(options: Sequence[str]) -> list[str]:
+    """Join the run that ``torchrun`` started and return this rank's options for rl-zoo's ``train``.
+
+    All ranks get the seed of rank 0. The others print nothing, evaluate nothing, and write below a
+    temporary folder of their own. Without ``torchrun`` the options stay as they are.
+
+    Raises
+    ------
+    ValueError
+        A search for hyperparameters is asked for: its trials are independent runs.
+    """
+    init_from_env()
+    if world_size() == 1:
+        return list(options)
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--seed", type=int, default=-1)
+    parser.add_argument("-optimize", "--optimize-hyperparameters", action="store_true")
+    parsed = parser.parse_known_args(options)[0]
+    if parsed.optimize_hyperparameters:
+        raise ValueError(
+            "-optimize is not allowed with torchrun: start several processes that share a "
+            "--storage and a --study-name"
+        )
+    seed = parsed.seed if parsed.seed >= 0 else int(np.random.default_rng().integers(2**32))
+    quiet: Iterable[str] = ()
+    if rank() > 0:
+        folder = tempfile.TemporaryDirectory()
+        atexit.register(folder.cleanup)
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 until the process ends
+        quiet = ("--log-folder", folder.name, "--eval-freq", "-1", "--save-freq", "-1")
+    return [*options, "--seed", str(int(broadcast(torch.tensor(seed)))), *quiet]

@@ -18,11 +18,11 @@ LAYERS = {
     "parameters": set(),
     "distributed": set(),
     "vec_env": set(),
-    "episodes": set(),
+    "episodes": {"distributed"},
     "curvature": {"cubic", "parameters", "distributed", "episodes"},
     "base": {"cubic", "parameters", "distributed", "vec_env", "episodes", "curvature"},
     "crpn": {"cubic", "curvature", "base"},
-    "acrpn": {"cubic", "curvature", "base"},
+    "acrpn": {"cubic", "distributed", "curvature", "base"},
     "sosp": {"cubic", "parameters", "distributed", "curvature", "base"},
     "theory": set(),
     "callbacks": {"base"},
@@ -34,7 +34,7 @@ SB3 = {"stable_baselines3", "gymnasium"}
 THIRD_PARTY = {
     "cubic": ARRAYS,
     "parameters": {"torch"},
-    "distributed": {"torch"},
+    "distributed": {"numpy", "torch"},
     "theory": set(),
     "zoo": {*ARRAYS, *SB3, "rl_zoo3", "optuna"},
 }

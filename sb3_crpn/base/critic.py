@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -11,6 +12,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 from torch.nn import functional
 
+from sb3_crpn.distributed import all_max, all_sum, gather_counts, mean_and_variance, world_size
 from sb3_crpn.episodes import EpisodeBatch, Observations
 from sb3_crpn.episodes.batch import FloatArray, map_observations
 from sb3_crpn.parameters import ActorParameters
@@ -37,9 +39,10 @@ def fit_critic(
     actor
         Parameters that stay as they are, also where the critic shares them.
     batch
-        The episodes.
+        This rank's episodes, possibly none. Gradients, losses and units are those of all ranks'.
     n_epochs, batch_size
-        Passes over the steps of the batch, in random minibatches of this size.
+        Passes over the steps of all ranks' batches, in random minibatches of this size, to which
+        each rank contributes in proportion to its steps.
     rng
         Of the minibatches.
 
@@ -49,44 +52,80 @@ def fit_critic(
         The mean loss over all minibatches, in the rewards' units (nan for no epochs). Returns or a
         loss that are not finite end the fit with the parameters as they are: infinity.
     """
-    if not np.isfinite(batch.returns).all():
+    largest = float(np.abs(batch.returns).max(initial=0.0))
+    largest = all_max(largest if np.isfinite(largest) else float("inf"))
+    if np.isinf(largest):
         return float("inf")
     if not n_epochs:
         return float("nan")
     # not in training mode: a normalisation layer's statistics may be the actor's too
     policy.set_training_mode(False)
     layer = _output_layer(policy, actor)
-    shift, scale = (0.0, 1.0) if layer is None else _units(batch.returns)
+    shift, scale = (0.0, 1.0) if layer is None else _units(batch.returns, largest)
     returns = torch.as_tensor(
         (batch.returns - shift) / scale, dtype=torch.float32, device=policy.device
     )
     losses = []
     with _in_units(layer, shift, scale):
-        for _ in range(n_epochs):
-            order = torch.as_tensor(rng.permutation(batch.n_steps), device=policy.device)
-            for chosen in torch.split(order, batch_size):
-                values = policy.predict_values(_at(batch.observations, chosen)).flatten()
-                loss = functional.mse_loss(values, returns[chosen])
-                losses.append(loss.item())
-                if not np.isfinite(losses[-1]):
-                    return float("inf")
-                policy.optimizer.zero_grad()
-                torch.autograd.backward(loss)
-                for parameter in actor.tensors:
-                    parameter.grad = None  # the optimiser passes over it
-                policy.optimizer.step()
+        for chosen in _minibatches(batch.n_steps, n_epochs, batch_size, rng, policy.device):
+            policy.optimizer.zero_grad()
+            loss = _backward(policy, _at(batch.observations, chosen), returns[chosen])
+            for parameter in actor.tensors:
+                parameter.grad = None  # the optimiser passes over it
+            losses.append(_average(policy, actor, loss, len(chosen)))
+            if not np.isfinite(losses[-1]):
+                return float("inf")
+            policy.optimizer.step()
     return float(np.mean(losses)) * scale**2
+
+
+def _minibatches(
+    n_steps: int, n_epochs: int, batch_size: int, rng: np.random.Generator, device: torch.device
+) -> Iterator[torch.Tensor]:
+    """Yield this rank's steps of each minibatch: equally many minibatches on every rank."""
+    total = sum(gather_counts(n_steps))
+    count = math.ceil(total / batch_size)
+    size = max(1, math.ceil(batch_size * n_steps / total))
+    for _ in range(n_epochs):
+        order = torch.as_tensor(rng.permutation(n_steps), device=device)
+        for start in range(0, count * size, size):
+            yield order[start : start + size]
+
+
+def _backward(
+    policy: ActorCriticPolicy, observations: Observations, returns: torch.Tensor
+) -> float:
+    """Leave the gradient of the mean squared error in the parameters, and return the error."""
+    if not len(returns):
+        return 0.0
+    loss = functional.mse_loss(policy.predict_values(observations).flatten(), returns)
+    torch.autograd.backward(loss)
+    return loss.item()
+
+
+def _average(policy: ActorCriticPolicy, actor: ActorParameters, loss: float, n_steps: int) -> float:
+    """Replace gradients and loss by their means over all ranks' steps, in one message."""
+    if world_size() == 1:
+        return loss
+    fixed = {id(tensor) for tensor in actor.tensors}
+    own = [p for p in policy.parameters() if p.requires_grad and id(p) not in fixed]
+    gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in own]
+    flat = torch.cat([gradient.reshape(-1) for gradient in gradients])
+    total = all_sum(n_steps * torch.cat([flat, flat.new_tensor([loss, 1.0])]))
+    *means, last = torch.split(total / total[-1], [*(p.numel() for p in own), 2])
+    for parameter, gradient in zip(own, means, strict=True):
+        parameter.grad = gradient.view_as(parameter).to(parameter.dtype)
+    return float(last[0])
 
 
 def _at(observations: Observations, steps: torch.Tensor) -> Observations:
     return map_observations(observations, lambda tensor: tensor[steps])
 
 
-def _units(returns: FloatArray) -> tuple[float, float]:
+def _units(returns: FloatArray, largest: float) -> tuple[float, float]:
     """Return the mean and the standard deviation of the returns, the latter never negligible."""
-    shift = float(returns.mean())
-    floor = 0.01 * float(np.abs(returns).max())
-    return shift, max(float(returns.std()), floor) or 1.0
+    shift, variance = mean_and_variance(returns)
+    return shift, max(math.sqrt(variance), 0.01 * largest) or 1.0
 
 
 def _output_layer(policy: ActorCriticPolicy, actor: ActorParameters) -> nn.Linear | None:

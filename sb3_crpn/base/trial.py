@@ -7,9 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_crpn.curvature.scores import mean_divergence, policy_distribution
+from sb3_crpn.distributed import all_sum, broadcast
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.parameters import ActorParameters
 
@@ -48,34 +50,54 @@ class StepTester:
     policy, actor
         The policy at θ, in evaluation mode, and its actor's parameters.
     batch
-        The episodes on which steps are tried.
+        This rank's episodes on which steps are tried.
+    max_steps
+        Most steps in one forward pass, but at least one episode; ``None``: all.
     """
 
     def __init__(
-        self, policy: ActorCriticPolicy, actor: ActorParameters, batch: EpisodeBatch
+        self,
+        policy: ActorCriticPolicy,
+        actor: ActorParameters,
+        batch: EpisodeBatch,
+        max_steps: int | None = None,
     ) -> None:
-        self._policy, self._actor, self._batch = policy, actor, batch
+        self._policy, self._actor = policy, actor
+        self._sizes = torch.tensor([batch.n_steps, batch.n_episodes], dtype=torch.float64)
         self._origin = actor.snapshot()
         self._vector = actor.vector
-        with torch.no_grad():
-            self._reference = policy_distribution(policy, batch)
-            self._log_prob = self._reference.log_prob(batch.actions)
-        self._weights = self._log_prob.new_tensor(batch.weights)
+        self._pieces: list[tuple[EpisodeBatch, Distribution, torch.Tensor, torch.Tensor]] = []
+        for piece in batch.pieces(max_steps):
+            with torch.no_grad():
+                reference = policy_distribution(policy, piece)
+                log_prob = reference.log_prob(piece.actions)
+            weights = log_prob.new_tensor(piece.weights)
+            self._pieces.append((piece, reference, log_prob, weights))
 
     def try_step(self, step: torch.Tensor) -> Trial:
-        """Leave the actor at θ + ``step``, [d], and say what that does."""
+        """Leave the actor at θ + ``step``, [d], of rank 0, and say what that does."""
+        step = broadcast(step)
         if not torch.isfinite(step).all():
             return Trial(math.inf, math.inf)
         self._actor.restore(self._actor.unflatten(self._vector + step))
+        sums = torch.tensor(self._sums(), dtype=torch.float64)
+        divergence, change, n_steps, n_episodes = all_sum(torch.cat([sums, self._sizes])).tolist()
+        return Trial(divergence / n_steps, change / n_episodes)
+
+    def _sums(self) -> tuple[float, float]:
+        """Return Σ_i KL_i and Σ_i A_i (π_θ+s/π_θ - 1) over this rank's steps."""
+        divergence = change = 0.0
         try:
-            with torch.no_grad():
-                distribution = policy_distribution(self._policy, self._batch)
-                log_ratio = distribution.log_prob(self._batch.actions) - self._log_prob
-                divergence = mean_divergence(self._reference, distribution)
+            for piece, reference, log_prob, weights in self._pieces:
+                with torch.no_grad():
+                    distribution = policy_distribution(self._policy, piece)
+                    log_ratio = distribution.log_prob(piece.actions) - log_prob
+                    mean = mean_divergence(reference, distribution)
+                divergence += piece.n_steps * mean.item()
+                change += (weights * torch.expm1(log_ratio)).double().sum().item()
         except ValueError:  # torch's distributions refuse parameters that are not finite
-            return Trial(math.inf, math.inf)
-        change = (self._weights * torch.expm1(log_ratio)).double().sum() / self._batch.n_episodes
-        return Trial(divergence.item(), change.item())
+            return math.inf, math.inf
+        return divergence, change
 
     def restore(self) -> None:
         """Put the actor back to θ, bit for bit."""

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
+from typing import Literal
 
 import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_crpn.curvature.scores import EpisodeGroup, PairWeights
-from sb3_crpn.distributed import all_sum
-from sb3_crpn.episodes.batch import EpisodeBatch
+from sb3_crpn.distributed import all_sum, gather_counts, rank
+from sb3_crpn.episodes.batch import EpisodeBatch, IntArray, deal, episode_runs
 from sb3_crpn.parameters import ActorParameters
 
 # Groups whose disagreement measures the noise: two give an unbiased estimate of it, and more of
@@ -18,36 +20,108 @@ from sb3_crpn.parameters import ActorParameters
 N_GROUPS = 2
 
 
+class NoiseGroups:
+    """The episodes of all ranks, dealt in turn to K groups, of which this rank holds a part.
+
+    K = 2, or 1 where there is only one episode.
+
+    Parameters
+    ----------
+    policy, actor, batch, pair_weights
+        As :class:`EpisodeGroup` takes them; ``batch`` holds this rank's episodes, possibly none.
+    max_steps
+        ``None``: one graph a group, kept for every product. Otherwise the groups are sums over
+        runs of episodes of at most so many steps, each with a graph that lives for one product.
+
+    Attributes
+    ----------
+    n_episodes, n_steps
+        Sizes of the groups over all ranks, float64 [K].
+    """
+
+    def __init__(
+        self,
+        policy: ActorCriticPolicy,
+        actor: ActorParameters,
+        batch: EpisodeBatch,
+        pair_weights: PairWeights,
+        max_steps: int | None,
+    ) -> None:
+        counts = gather_counts(batch.n_episodes)
+        dealt = deal(batch.n_episodes, min(N_GROUPS, sum(counts)), first=sum(counts[: rank()]))
+        own = [[len(episodes), batch.lengths[episodes].sum()] for episodes in dealt]
+        self.n_episodes, self.n_steps = all_sum(torch.tensor(own, dtype=torch.float64)).T
+        self._zero = torch.zeros(len(actor), dtype=torch.float64, device=actor.device)
+
+        def run(episodes: IntArray) -> Callable[[], EpisodeGroup]:
+            def open_run() -> EpisodeGroup:
+                return EpisodeGroup(policy, actor, batch.take(episodes), pair_weights)
+
+            return cache(open_run) if max_steps is None else open_run
+
+        limit = batch.n_steps if max_steps is None else max_steps
+        self._groups = [
+            [run(episodes[part]) for part in episode_runs(batch.lengths[episodes], limit)]
+            for episodes in dealt
+        ]
+
+    def means(
+        self,
+        quantity: Callable[[EpisodeGroup], torch.Tensor],
+        unit: Literal["n_episodes", "n_steps"],
+    ) -> torch.Tensor:
+        """Return this rank's parts of the groups' means of ``quantity``, [K, d].
+
+        The parts of all ranks add up to the means. ``quantity`` is itself a mean over the episodes
+        or the steps of what it is given.
+        """
+        return torch.stack(
+            [
+                self._mean(runs, quantity, unit, size)
+                for runs, size in zip(self._groups, getattr(self, unit).tolist(), strict=True)
+            ]
+        )
+
+    def _mean(
+        self,
+        runs: list[Callable[[], EpisodeGroup]],
+        quantity: Callable[[EpisodeGroup], torch.Tensor],
+        unit: str,
+        size: float,
+    ) -> torch.Tensor:
+        total = self._zero
+        for open_run in runs:
+            group = open_run()
+            total = total + quantity(group) * (getattr(group.batch, unit) / size)
+        return total
+
+
 class EpisodeOperator:
     """A symmetric d × d matrix B = Σ_k w_k B_k, known through its products B_k v.
 
     k runs over groups of whole episodes; Σ w_k = 1. ``operator @ v`` costs one product with each
-    group.
+    group. With several ranks a product is a sum over them: all must ask for it.
 
     Parameters
     ----------
     size
         d.
-    products
-        v ↦ B_k v for each group, float64 [d] to [d].
+    group_products
+        v ↦ this rank's parts of B_k v, float64 [d] to [K, d]; the parts of all ranks add up to
+        B_k v.
     sizes
-        What w_k is proportional to: the group's episodes, or its steps.
+        What w_k is proportional to, [K]: the group's episodes, or its steps, over all ranks.
     """
 
     def __init__(
         self,
         size: int,
-        products: Sequence[Callable[[torch.Tensor], torch.Tensor]],
-        sizes: Sequence[int],
+        group_products: Callable[[torch.Tensor], torch.Tensor],
+        sizes: torch.Tensor,
     ) -> None:
         self.shape = (size, size)
-        self._products = products
-        own = torch.tensor(sizes, dtype=torch.float64)
-        self.weights = own / all_sum(own.sum())
-
-    def group_products(self, vector: torch.Tensor) -> torch.Tensor:
-        """Return B_k v for each group, [K, d]."""
-        return torch.stack([product(vector) for product in self._products])
+        self.group_products = group_products
+        self.weights = sizes / sizes.sum()
 
     def __matmul__(self, other: torch.Tensor) -> torch.Tensor:
         """Return B v for v of shape [d], or B V for V of shape [d, n]; float64."""
@@ -57,13 +131,15 @@ class EpisodeOperator:
                 f"operand has shape {tuple(other.shape)}, must be ({self.shape[1]},) "
                 f"or ({self.shape[1]}, n)"
             )
-        if other.ndim == 2:
-            return torch.stack([self @ column for column in other.T], dim=1)
-        return self.mean(self.group_products(other))
+        if other.ndim == 1:
+            return all_sum(self.mean(self.group_products(other)))
+        columns = [self.mean(self.group_products(column)) for column in other.T]
+        return all_sum(torch.stack(columns, dim=1))
 
     def mean(self, groups: torch.Tensor) -> torch.Tensor:
-        """Return Σ_k w_k x_k for x_k of any shape, [K, …] to […]."""
-        return all_sum(torch.tensordot(self.weights.to(groups.device), groups, dims=1))
+        """Return Σ_k w_k x_k for x_k of any shape, [K, …] to […], on this rank alone."""
+        mean: torch.Tensor = torch.tensordot(self.weights.to(groups.device), groups, dims=1)
+        return mean
 
     def to_dense(self) -> torch.Tensor:
         """Return B, exactly symmetric, [d, d]: d products, for small d and for tests."""
@@ -87,7 +163,7 @@ class CurvatureEstimate:
     gradient_noise
         Estimate of E‖g - ∇J‖² / ‖g‖², from the disagreement of groups; nan for one episode.
     gradient_batch
-        The episodes of g.
+        This rank's episodes of g.
     """
 
     gradient: torch.Tensor
@@ -103,6 +179,7 @@ def estimate_curvature(
     gradient_batch: EpisodeBatch,
     hessian_batch: EpisodeBatch,
     pair_weights: PairWeights,
+    max_steps: int | None = None,
 ) -> CurvatureEstimate:
     """Estimate g, H and F as in DESIGN section 2.
 
@@ -111,31 +188,33 @@ def estimate_curvature(
     policy, actor
         The policy at θ, in evaluation mode, and its actor's parameters.
     gradient_batch, hessian_batch
-        The m episodes of g and F and the b of H. When they are the same object, the graphs are
-        shared.
+        This rank's of the m episodes of g and F and of the b of H. When they are the same object,
+        on every rank or on none, the graphs are shared.
     pair_weights
         W of the Hessian estimator.
+    max_steps
+        Most steps whose graphs are held at a time, but at least one episode; ``None``: all.
     """
-
-    def group(batch: EpisodeBatch) -> list[EpisodeGroup]:
-        return [EpisodeGroup(policy, actor, part, pair_weights) for part in batch.split(N_GROUPS)]
-
-    of_gradient = group(gradient_batch)
-    of_hessian = of_gradient if hessian_batch is gradient_batch else group(hessian_batch)
-    gradients = torch.stack([part.gradient() for part in of_gradient])
-    shares = torch.tensor([part.batch.n_episodes for part in of_gradient], dtype=torch.float64)
-    shares = (shares / all_sum(shares.sum())).to(gradients.device)
+    batches = [gradient_batch]
+    if hessian_batch is not gradient_batch:
+        batches.append(hessian_batch)
+    if max_steps is not None and sum(batch.n_steps for batch in batches) <= max_steps:
+        max_steps = None
+    groups = [NoiseGroups(policy, actor, batch, pair_weights, max_steps) for batch in batches]
+    of_gradient, of_hessian = groups[0], groups[-1]
+    gradients = all_sum(of_gradient.means(EpisodeGroup.gradient, "n_episodes"))
+    shares = (of_gradient.n_episodes / of_gradient.n_episodes.sum()).to(gradients.device)
     return CurvatureEstimate(
-        gradient=all_sum(shares @ gradients),
+        gradient=shares @ gradients,
         hessian=EpisodeOperator(
             len(actor),
-            [part.hessian_product for part in of_hessian],
-            [part.batch.n_episodes for part in of_hessian],
+            lambda v: of_hessian.means(lambda group: group.hessian_product(v), "n_episodes"),
+            of_hessian.n_episodes,
         ),
         fisher=EpisodeOperator(
             len(actor),
-            [part.fisher_product for part in of_gradient],
-            [part.batch.n_steps for part in of_gradient],
+            lambda v: of_gradient.means(lambda group: group.fisher_product(v), "n_steps"),
+            of_gradient.n_steps,
         ),
         gradient_noise=relative_noise(gradients, shares),
         gradient_batch=gradient_batch,
@@ -148,10 +227,9 @@ def relative_noise(groups: torch.Tensor, weights: torch.Tensor) -> float:
     An estimate of E‖x - E x‖² / ‖x‖² from the means x_k [K, …] of K independent groups whose
     sizes are as w_k. For K = 2 the numerator is w_1 w_2 ‖x_1 - x_2‖². nan when K = 1 or x = 0.
     """
-    n_groups = all_sum(torch.tensor(len(groups))).item()
-    mean = all_sum(torch.tensordot(weights, groups, dims=1))
+    mean = torch.tensordot(weights, groups, dims=1)
     size = (mean**2).sum().item()
-    if n_groups < 2 or size == 0.0:
+    if len(groups) < 2 or size == 0.0:
         return float("nan")
-    spread = all_sum((weights * ((groups - mean) ** 2).flatten(1).sum(1)).sum()).item()
-    return spread / (n_groups - 1) / size
+    spread = (weights * ((groups - mean) ** 2).flatten(1).sum(1)).sum().item()
+    return float(spread / (len(groups) - 1) / size)

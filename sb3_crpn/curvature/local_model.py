@@ -9,6 +9,7 @@ import torch
 
 from sb3_crpn.cubic import krylov_basis
 from sb3_crpn.curvature.estimate import CurvatureEstimate, EpisodeOperator, relative_noise
+from sb3_crpn.distributed import all_sum
 
 
 @dataclass(frozen=True)
@@ -85,11 +86,11 @@ def projected_model(
     """
     basis, group_products, fisher_products = _subspace(estimate, damping is not None, dim)
     gradient = basis.T @ estimate.gradient
-    hessians = basis.T @ group_products  # [K, k, k]
+    hessians = all_sum(basis.T @ group_products)  # [K, k, k]
     if damping is not None:
         # VᵀFV = QΛQᵀ and s = VQ(Λ + ε)^(-½) y make the M-norm of s the Euclidean norm of y;
         # F ⪰ 0, so that a negative eigenvalue is rounding
-        fisher = basis.T @ fisher_products
+        fisher = all_sum(basis.T @ fisher_products)
         eigenvalues, vectors = torch.linalg.eigh(0.5 * (fisher + fisher.T))
         whiten = ((eigenvalues.clamp(min=0.0) + damping) ** -0.5)[:, None] * vectors.T
         basis = basis @ whiten.T
@@ -117,7 +118,7 @@ def projected_model(
 def _subspace(
     estimate: CurvatureEstimate, fisher: bool, dim: int | None
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return an orthonormal basis V [d, k], the groups' H_k V [K, d, k] and, if asked, F V."""
+    """Return an orthonormal basis V [d, k], and this rank's parts of H_k V [K, d, k] and F V."""
     hessian, metric = _Recorder(estimate.hessian), _Recorder(estimate.fisher)
     generator_of_basis = metric if fisher else hessian
     if dim is None:
@@ -127,8 +128,7 @@ def _subspace(
         basis = krylov_basis(generator_of_basis, _start(estimate.gradient), dim)
     for recorder in (hessian, metric) if fisher else (hessian,):
         if not recorder.columns:
-            for column in basis.T:
-                recorder(column)
+            recorder.columns = [recorder.operator.group_products(column) for column in basis.T]
     products = torch.stack(hessian.columns, dim=2)
     if not fisher:
         return basis, products, basis
@@ -147,13 +147,13 @@ class _Recorder:
     """v ↦ Bv, keeping the groups' B_k v of every call."""
 
     def __init__(self, operator: EpisodeOperator) -> None:
-        self._operator = operator
+        self.operator = operator
         self.columns: list[torch.Tensor] = []
 
     def __call__(self, vector: torch.Tensor) -> torch.Tensor:
-        products = self._operator.group_products(vector)
+        products = self.operator.group_products(vector)
         self.columns.append(products)
-        return self._operator.mean(products)
+        return all_sum(self.operator.mean(products))
 
 
 def james_stein(hessians: torch.Tensor, weights: torch.Tensor) -> float:

@@ -27,6 +27,27 @@ def episode_time(lengths: IntArray) -> IntArray:
     return time
 
 
+def episode_runs(lengths: IntArray, max_steps: int) -> list[slice]:
+    """Cut episodes laid end to end into runs of at most ``max_steps`` steps, or of one episode."""
+    ends = np.cumsum(lengths)
+    runs, start = [], 0
+    while start < len(lengths):
+        limit = ends[start] - lengths[start] + max_steps
+        stop = max(start + 1, int(np.searchsorted(ends, limit, side="right")))
+        runs.append(slice(start, stop))
+        start = stop
+    return runs
+
+
+def deal(n_episodes: int, n_groups: int, first: int = 0) -> list[IntArray]:
+    """Deal episodes in turn to the groups, beginning with group ``first`` mod ``n_groups``.
+
+    The episodes are independent and identically distributed, so any split that does not look at
+    them is a random one.
+    """
+    return [np.arange((k - first) % n_groups, n_episodes, n_groups) for k in range(n_groups)]
+
+
 def episode_scan(
     values: FloatArray, factor: float, lengths: IntArray, *, reverse: bool = False
 ) -> FloatArray:
@@ -51,6 +72,8 @@ def episode_scan(
     FloatArray
         y, shape of ``values``.
     """
+    if not len(values):
+        return values
     if reverse:
         return episode_scan(values[::-1], factor, lengths[::-1])[::-1]
     filtered: FloatArray = lfilter([1.0], [1.0, -factor], values, axis=0)
@@ -127,25 +150,34 @@ class EpisodeBatch:
         """Return the batch of the chosen episodes, in the order given."""
         lengths = self.lengths[episodes]
         steps = np.repeat(episode_starts(self.lengths)[episodes], lengths) + episode_time(lengths)
+        return self._select(episodes, steps)
+
+    def split(self, n_groups: int) -> list[EpisodeBatch]:
+        """Deal the episodes to at most ``n_groups`` batches, none of them empty."""
+        n_groups = min(n_groups, self.n_episodes)
+        if n_groups == 1:
+            return [self]
+        return [self.take(episodes) for episodes in deal(self.n_episodes, n_groups)]
+
+    def pieces(self, max_steps: int | None) -> list[EpisodeBatch]:
+        """Cut the batch, as :func:`episode_runs` does, into batches that share its memory."""
+        if max_steps is None or self.n_steps <= max_steps:
+            return [self] if self.n_episodes else []
+        ends = np.append(0, np.cumsum(self.lengths))
+        return [
+            self._select(episodes, slice(ends[episodes.start], ends[episodes.stop]))
+            for episodes in episode_runs(self.lengths, max_steps)
+        ]
+
+    def _select(self, episodes: slice | IntArray, steps: slice | IntArray) -> EpisodeBatch:
         return EpisodeBatch(
             observations=map_observations(self.observations, lambda tensor: tensor[steps]),
             actions=self.actions[steps],
-            lengths=lengths,
+            lengths=self.lengths[episodes],
             weights=self.weights[steps],
             values=self.values[steps],
             returns=self.returns[steps],
         )
-
-    def split(self, n_groups: int) -> list[EpisodeBatch]:
-        """Deal the episodes in turn into at most ``n_groups`` batches, none of them empty.
-
-        The episodes are independent and identically distributed, so any split that does not look
-        at them is a random one.
-        """
-        n_groups = min(n_groups, self.n_episodes)
-        if n_groups == 1:
-            return [self]
-        return [self.take(np.arange(k, self.n_episodes, n_groups)) for k in range(n_groups)]
 
 
 def map_observations(

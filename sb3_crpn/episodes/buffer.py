@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator
 from typing import Any
 
@@ -13,6 +14,7 @@ from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import DictRolloutBufferSamples, RolloutBufferSamples
 
+from sb3_crpn.distributed import all_sum, mean_and_variance
 from sb3_crpn.episodes.batch import (
     EpisodeBatch,
     IntArray,
@@ -74,8 +76,10 @@ class EpisodeRolloutBuffer(RolloutBuffer):
 
     @property
     def used_fraction(self) -> float:
-        """Share of the simulated steps that belong to kept episodes."""
-        return float(self.lengths.sum()) / (self.pos * self.n_envs)
+        """Share of the steps simulated by all ranks that belong to kept episodes."""
+        steps = torch.tensor([self.lengths.sum(), self.pos * self.n_envs], dtype=torch.float64)
+        kept, simulated = all_sum(steps).tolist()
+        return float(kept / simulated)
 
     def _kept_steps(self) -> tuple[IntArray, IntArray]:
         """Return the (row, environment) of every kept step, episodes end to end."""
@@ -121,13 +125,14 @@ class EpisodeRolloutBuffer(RolloutBuffer):
         """Return the kept episodes with their cost weights A_i = -γ^i Â_i.
 
         Â is the advantage, or the λ-return where ``baseline`` is false; normalised to mean 0 and
-        standard deviation 1 over the batch on request. Without ``discount_visitation`` the factor
-        γ^i is dropped.
+        standard deviation 1 over the batch of all ranks on request. Without
+        ``discount_visitation`` the factor γ^i is dropped.
         """
         kept = self._kept_steps()
         weights = (self.advantages if baseline else self.returns)[kept].astype(np.float64)
         if normalize_advantage:
-            weights = (weights - weights.mean()) / (weights.std() + 1e-8)  # 1e-8: as in SB3's PPO
+            mean, variance = mean_and_variance(weights)
+            weights = (weights - mean) / (math.sqrt(variance) + 1e-8)  # 1e-8: as in SB3's PPO
         if discount_visitation:
             weights *= self.gamma ** episode_time(self.lengths)
         return EpisodeBatch(

@@ -117,6 +117,16 @@ def test_a_trial_measures_the_surrogate_cost_and_the_divergence(kind):
     assert abs(trial.kl - samples.mean()) < 5.0 * error
 
 
+@pytest.mark.parametrize("kind", ACTION_SPACES)
+def test_a_trial_in_pieces_is_the_same(kind):
+    policy, actor, batch, step = attempt_of(kind)
+    whole = StepTester(policy, actor, batch).try_step(step)
+    actor.assign(actor.vector - step)
+    pieces = StepTester(policy, actor, batch, max_steps=4).try_step(step)
+    assert pieces.kl == pytest.approx(whole.kl, rel=1e-12)
+    assert pieces.surrogate_change == pytest.approx(whole.surrogate_change, rel=1e-12)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_restore_is_bitwise(dtype):
     policy, actor, batch, step = attempt_of("gaussian", dtype)

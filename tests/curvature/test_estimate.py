@@ -114,6 +114,42 @@ def test_graphs_are_shared_and_kept(frozen, monkeypatch):
     assert len(calls) == n_groups
 
 
+@pytest.mark.parametrize("kind", ["discrete", "gaussian"])
+@pytest.mark.parametrize("max_steps", [1, 4, 8, 14])
+def test_batches_that_do_not_fit_are_accumulated(kind, max_steps, monkeypatch):
+    policy, actor = small_policy(kind)
+    batch = frozen_episodes(policy, lengths=(3, 1, 4, 2, 5))
+    few = batch.take(np.array([3, 0, 4]))
+    whole = estimate_curvature(policy, actor, few, batch, PairWeights("causal", 0.9))
+    passes = []
+    forward = policy.get_distribution
+    monkeypatch.setattr(
+        policy, "get_distribution", lambda obs: passes.append(len(obs)) or forward(obs)
+    )
+    split = estimate_curvature(policy, actor, few, batch, PairWeights("causal", 0.9), max_steps)
+    v = torch.linspace(-1.0, 1.0, len(actor), dtype=torch.float64)
+    exactly = {"rtol": 1e-12, "atol": 1e-14}
+    torch.testing.assert_close(split.gradient, whole.gradient, **exactly)
+    for name in ("hessian", "fisher"):
+        for _ in range(2):
+            expected = getattr(whole, name).group_products(v)
+            passes.clear()
+            products = getattr(split, name).group_products(v)
+            torch.testing.assert_close(products, expected, **exactly)
+            assert passes  # built anew
+            assert max(passes) <= max(max_steps, 5)
+    assert split.gradient_noise == pytest.approx(whole.gradient_noise, rel=1e-12)
+
+
+def test_a_batch_that_fits_is_not_split(frozen, monkeypatch):
+    policy, actor, batch = frozen
+    estimate = estimate_curvature(policy, actor, batch, batch, PairWeights("causal"), 15)
+    v = torch.ones(len(actor), dtype=torch.float64)
+    estimate.hessian @ v
+    monkeypatch.setattr(policy, "get_distribution", None)
+    estimate.hessian @ v
+
+
 def test_the_operator_is_linear_and_symmetric(frozen):
     policy, actor, batch = frozen
     estimate = estimate_curvature(policy, actor, batch, batch, PairWeights("causal", 0.5))
@@ -134,13 +170,14 @@ def test_the_operator_is_linear_and_symmetric(frozen):
 
 @pytest.mark.parametrize("shape", [(), (3,), (3, 4), (4, 1, 1)])
 def test_operands_of_the_wrong_shape_are_refused(shape):
-    operator = EpisodeOperator(4, [lambda v: v], [1])
+    operator = EpisodeOperator(4, lambda v: v[None], torch.ones(1))
     with pytest.raises(ValueError, match=r"operand has shape .* must be \(4,\) or \(4, n\)"):
         operator @ torch.ones(shape)
 
 
 def test_groups_are_weighted_by_their_sizes():
-    operator = EpisodeOperator(2, [lambda v: v, lambda v: 5.0 * v], [3, 1])
+    sizes = torch.tensor([3.0, 1.0], dtype=torch.float64)
+    operator = EpisodeOperator(2, lambda v: torch.stack([v, 5.0 * v]), sizes)
     assert operator.weights.tolist() == [0.75, 0.25]
     assert (operator @ torch.ones(2)).tolist() == [2.0, 2.0]
 

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from sb3_crpn.episodes import EpisodeBatch, episode_scan
 from sb3_crpn.episodes.batch import (
+    deal,
     episode_starts,
     episode_time,
     generalized_advantages,
@@ -123,6 +124,49 @@ def test_split_deals_every_episode_once(lengths, n_groups):
             episode_time(group.lengths) + np.repeat(group.weights[starts], group.lengths),
         )
     assert batch.split(1) == [batch]
+
+
+@given(st.integers(0, 20), st.integers(1, 8), st.integers(0, 20))
+def test_every_episode_is_dealt_once(n_episodes, n_groups, first):
+    groups = deal(n_episodes, n_groups, first)
+    sizes = [len(group) for group in groups]
+    assert len(groups) == n_groups
+    assert max(sizes) - min(sizes) <= 1
+    assert np.array_equal(np.sort(np.concatenate(groups)), np.arange(n_episodes))
+    if n_episodes:
+        assert groups[first % n_groups][0] == 0
+
+
+@given(st.lists(st.integers(0, 6), min_size=1, max_size=4), st.integers(1, 3))
+def test_dealing_goes_on_where_another_rank_stopped(counts, n_groups):
+    whole = deal(sum(counts), n_groups)
+    starts = np.cumsum(counts) - counts
+    parts = [deal(n, n_groups, first=start) for n, start in zip(counts, starts, strict=True)]
+    for k, group in enumerate(whole):
+        joined = [part[k] + start for part, start in zip(parts, starts, strict=True)]
+        assert np.array_equal(np.concatenate(joined), group)
+
+
+@given(LENGTHS, st.integers(1, 12))
+@settings(deadline=None)
+def test_pieces_are_runs_of_whole_episodes_within_the_limit(lengths, max_steps):
+    batch = numbered_batch(lengths)
+    pieces = batch.pieces(max_steps)
+    assert np.array_equal(np.concatenate([piece.weights for piece in pieces]), batch.weights)
+    assert np.array_equal(np.concatenate([piece.lengths for piece in pieces]), lengths)
+    for piece, following in zip(pieces, [*pieces[1:], None], strict=True):
+        assert piece.n_steps <= max_steps or piece.n_episodes == 1
+        assert piece.actions.data_ptr() >= batch.actions.data_ptr()
+        if following is not None:
+            assert piece.n_steps + following.lengths[0] > max_steps
+    assert batch.pieces(None) == [batch]
+
+
+def test_nothing_has_no_pieces():
+    nothing = numbered_batch([2, 1]).take(np.arange(0))
+    assert nothing.n_episodes == nothing.n_steps == 0
+    assert nothing.pieces(None) == nothing.pieces(3) == []
+    assert episode_scan(nothing.weights, 0.5, nothing.lengths, reverse=True).shape == (0,)
 
 
 def test_map_observations_reaches_every_key():
