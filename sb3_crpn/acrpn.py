@@ -20,6 +20,7 @@ from sb3_crpn.base.arguments import (
 )
 from sb3_crpn.cubic import CubicStep, cubic_finalsolver, cubic_subsolver
 from sb3_crpn.curvature import CurvatureEstimate, LocalModel
+from sb3_crpn.distributed import broadcast
 
 
 class ACRPN(PolicyNewtonAlgorithm):
@@ -91,7 +92,7 @@ class ACRPN(PolicyNewtonAlgorithm):
 
     def _local_model(self, estimate: CurvatureEstimate) -> LocalModel:
         # one perturbation an update, whatever α is tried
-        self._perturbation_seed = int(self._rng.integers(2**31))
+        self._perturbation_seed = int(broadcast(torch.tensor(self._rng.integers(2**31))))
         return super()._local_model(estimate)
 
     def _solve(self, model: LocalModel, alpha: float) -> CubicStep:

@@ -36,6 +36,7 @@ BAD = {
     "horizon": COUNT,
     "batch_size": (*COUNT, None),
     "n_critic_updates": ("3", None, True, -1, 1.5, NAN),
+    "max_batch_timesteps": COUNT,
     "use_sde": FLAG,
     "sde_sample_freq": ("3", None, True, -2, 1.5, NAN),
     "rollout_buffer_class": (dict, "EpisodeRolloutBuffer", 1),

@@ -132,10 +132,10 @@ class Batches:
         self.estimate = update.estimate_curvature
         monkeypatch.setattr(update, "estimate_curvature", self)
 
-    def __call__(self, policy, actor, gradient_batch, hessian_batch, pair_weights):
+    def __call__(self, policy, actor, gradient_batch, hessian_batch, *rest):
         self.sizes.append((gradient_batch.n_episodes, hessian_batch.n_episodes))
         self.observations.append((gradient_batch.observations, hessian_batch.observations))
-        return self.estimate(policy, actor, gradient_batch, hessian_batch, pair_weights)
+        return self.estimate(policy, actor, gradient_batch, hessian_batch, *rest)
 
 
 @both

@@ -20,6 +20,7 @@ from sb3_crpn.base.arguments import check_arguments, check_sb3_arguments
 from sb3_crpn.base.random_state import RandomState
 from sb3_crpn.base.update import PolicyNewtonUpdate
 from sb3_crpn.curvature.scores import HessianEstimator
+from sb3_crpn.distributed import rank
 from sb3_crpn.episodes import DictEpisodeRolloutBuffer, EpisodeRolloutBuffer
 from sb3_crpn.parameters import ActorParameters
 
@@ -89,6 +90,10 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         Minibatch size of the critic.
     n_critic_updates
         Passes over the batch that fit the critic in each update, after the actor's step.
+    max_batch_timesteps
+        Most timesteps whose graphs are held in memory at a time, in runs of whole episodes, so
+        that the longest episode is the least; ``None``: the whole batch. Batches beyond it cost
+        a forward pass more at every product; results are the same to rounding.
     use_sde, sde_sample_freq, rollout_buffer_class, rollout_buffer_kwargs, stats_window_size
         As in SB3's on-policy algorithms; the buffer class must be an ``EpisodeRolloutBuffer``.
     tensorboard_log, policy_kwargs, verbose, seed, device, _init_setup_model
@@ -136,6 +141,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         horizon: int | None = None,
         batch_size: int = 128,
         n_critic_updates: int = 20,
+        max_batch_timesteps: int | None = None,
         use_sde: bool = False,
         sde_sample_freq: int = -1,
         rollout_buffer_class: type[EpisodeRolloutBuffer] | None = None,
@@ -175,7 +181,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             policy_kwargs=policy_kwargs,
-            verbose=verbose,
+            verbose=verbose if rank() == 0 else 0,
             seed=seed,
             device=device,
             _init_setup_model=False,
@@ -203,6 +209,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         self.horizon = horizon
         self.batch_size = batch_size
         self.n_critic_updates = n_critic_updates
+        self.max_batch_timesteps = max_batch_timesteps
         self._fitted_alpha: float | None = None  # the last α that met target_kl
         self._mean_episode_length = None
         if _init_setup_model:
@@ -228,7 +235,8 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         return ActorParameters.reachable(self.policy, log_prob)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor", "alpha_schedule", "_collecting"]
+        own = ["actor", "alpha_schedule", "_collecting", "_statistics"]
+        return [*super()._excluded_save_params(), *own]
 
     def learn(
         self: Self,

@@ -103,6 +103,7 @@ def check_arguments(model: Any) -> None:
         "horizon": partial(check_optional, check=at_least_one),
         "batch_size": at_least_one,
         "n_critic_updates": at_least_zero,
+        "max_batch_timesteps": partial(check_optional, check=at_least_one),
         "use_sde": check_flag,
         "sde_sample_freq": partial(check_integer, minimum=-1),
         "rollout_buffer_class": _check_buffer_class,

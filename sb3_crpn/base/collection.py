@@ -16,6 +16,8 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_crpn.base.ranks import Ranks
+from sb3_crpn.distributed import all_sum, share, world_size
 from sb3_crpn.episodes import EpisodeRolloutBuffer, EpisodeTracker, episodes_per_env, steps_to_quota
 from sb3_crpn.episodes.batch import IntArray
 from sb3_crpn.episodes.quota import EpisodeEnd
@@ -30,7 +32,7 @@ _COUNTERS = ("num_timesteps", "ep_info_buffer", "ep_success_buffer")
 Array: TypeAlias = npt.NDArray[Any]
 
 
-class EpisodeCollection(OnPolicyAlgorithm):
+class EpisodeCollection(Ranks, OnPolicyAlgorithm):
     """Collects whole episodes, a fixed quota from each environment (DESIGN section 2)."""
 
     horizon: int | None
@@ -59,7 +61,8 @@ class EpisodeCollection(OnPolicyAlgorithm):
         """Fill the buffer with whole episodes of the current policy.
 
         max(m_k, b_k) episodes are simulated; where neither is given, ``n_rollout_steps`` steps
-        per environment, in whole episodes at their last mean length.
+        per environment, in whole episodes at their last mean length. Each rank simulates its share
+        of them; only afterwards do the ranks add up their timesteps.
 
         Returns
         -------
@@ -76,11 +79,20 @@ class EpisodeCollection(OnPolicyAlgorithm):
         given = [number for number in self._batch_sizes if number is not None]
         quota = steps_to_quota(n_rollout_steps, self._mean_episode_length)
         if self._batch_sizes[0] is None:
-            given.append(quota * env.num_envs)
-        quotas = episodes_per_env(max(given), env.num_envs)
-        if not self._collect_episodes(env, callback, rollout_buffer, quotas):
+            given.append(quota * env.num_envs * world_size())
+        quotas = episodes_per_env(share(max(given)), env.num_envs)
+        before = self.num_timesteps
+        completed = self._collect_episodes(env, callback, rollout_buffer, quotas)
+        lengths = rollout_buffer.lengths
+        own = [not completed, self.num_timesteps - before, len(lengths), lengths.sum()]
+        stopped, n_simulated, n_episodes, n_kept = all_sum(
+            torch.tensor(own, dtype=torch.float64)
+        ).tolist()
+        self.num_timesteps = before + int(n_simulated)
+        self._share_statistics()
+        if stopped:
             return False
-        self._mean_episode_length = float(rollout_buffer.lengths.mean())
+        self._mean_episode_length = n_kept / n_episodes
         callback.on_rollout_end()
         return True
 
@@ -183,7 +195,7 @@ class EpisodeCollection(OnPolicyAlgorithm):
                 self._reset_environments(target)
             callback = CallbackList([])
             callback.init_callback(self)
-            quotas = episodes_per_env(n_episodes, target.num_envs)
+            quotas = episodes_per_env(share(n_episodes), target.num_envs)
             self._collect_episodes(target, callback, buffer, quotas)
         finally:
             self.__dict__.update(state)

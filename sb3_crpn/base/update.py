@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_crpn.base.arguments import check_integer, check_real
@@ -26,6 +25,7 @@ from sb3_crpn.curvature import (
     projected_model,
 )
 from sb3_crpn.curvature.scores import HessianEstimator
+from sb3_crpn.distributed import broadcast_state, gather_counts, mean_and_variance, share
 from sb3_crpn.episodes import EpisodeBatch, EpisodeRolloutBuffer
 from sb3_crpn.parameters import ActorParameters
 
@@ -48,6 +48,7 @@ class PolicyNewtonUpdate(EpisodeCollection):
     hessian_lambda: float
     hessian_shrinkage: float | Literal["auto"] | None
     krylov_dim: int | None
+    max_batch_timesteps: int | None
     normalize_advantage: bool
     discount_visitation: bool
     batch_size: int
@@ -64,6 +65,7 @@ class PolicyNewtonUpdate(EpisodeCollection):
         model = self._local_model(estimate)
         step = self._take_step(estimate.gradient_batch, model)
         value_loss = self._fit_critic(batch)
+        broadcast_state(self.policy)
         self._n_updates += 1
         self._log_update(batch, estimate, model, step, value_loss)
 
@@ -71,7 +73,7 @@ class PolicyNewtonUpdate(EpisodeCollection):
         """Estimate gradient and Hessian of J at the current policy from fresh episodes.
 
         The estimators are those of the constructor's arguments; nothing is learnt, and the
-        episodes do not count as training.
+        episodes do not count as training. With several ranks all must call, and share the episodes.
 
         Parameters
         ----------
@@ -81,17 +83,14 @@ class PolicyNewtonUpdate(EpisodeCollection):
             Where to simulate; ``None``: the training environment.
         """
         check_integer("n_episodes", n_episodes, 1)
+        broadcast_state(self.policy)
         batch = self._episode_batch(self._collect_fresh(n_episodes, env))
-        return estimate_curvature(self.policy, self.actor, batch, batch, self._pair_weights)
+        return self._estimate_from(batch, batch)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         """Keep the progress of schedules in [0, 1]: whole episodes overrun the last timestep."""
         super()._update_current_progress_remaining(num_timesteps, total_timesteps)
         self._current_progress_remaining = max(0.0, self._current_progress_remaining)
-
-    @property
-    def _pair_weights(self) -> PairWeights:
-        return PairWeights(self.hessian_estimator, self.hessian_lambda)
 
     def _scheduled_episodes(self) -> tuple[int | None, int | None]:
         progress = self._current_progress_remaining
@@ -115,17 +114,28 @@ class PolicyNewtonUpdate(EpisodeCollection):
     def _estimate(self, batch: EpisodeBatch) -> CurvatureEstimate:
         """Estimate g from m_k and H from b_k of the episodes."""
         m, b = self._batch_sizes  # of the progress at which they were simulated
-        gradient_batch = self._draw(batch, m)
-        hessian_batch = gradient_batch if b is None else self._draw(batch, b)
+        n_simulated = sum(gather_counts(batch.n_episodes))
+        gradient_batch = self._draw(batch, m, n_simulated)
+        hessian_batch = gradient_batch if b is None else self._draw(batch, b, n_simulated)
+        return self._estimate_from(gradient_batch, hessian_batch)
+
+    def _estimate_from(
+        self, gradient_batch: EpisodeBatch, hessian_batch: EpisodeBatch
+    ) -> CurvatureEstimate:
         return estimate_curvature(
-            self.policy, self.actor, gradient_batch, hessian_batch, self._pair_weights
+            self.policy,
+            self.actor,
+            gradient_batch,
+            hessian_batch,
+            PairWeights(self.hessian_estimator, self.hessian_lambda),
+            self.max_batch_timesteps,
         )
 
-    def _draw(self, batch: EpisodeBatch, n_episodes: int | None) -> EpisodeBatch:
-        """Draw episodes without replacement; all of them are the batch itself."""
-        if n_episodes is None or n_episodes >= batch.n_episodes:
+    def _draw(self, batch: EpisodeBatch, n_episodes: int | None, n_simulated: int) -> EpisodeBatch:
+        """Draw this rank's share of episodes without replacement; all are the batch itself."""
+        if n_episodes is None or n_episodes >= n_simulated:
             return batch
-        return batch.take(self._rng.choice(batch.n_episodes, n_episodes, replace=False))
+        return batch.take(self._rng.choice(batch.n_episodes, share(n_episodes), replace=False))
 
     def _prefers_dense(self) -> bool:
         """Whether the model is to be written out on all of ℝᵈ."""
@@ -156,7 +166,7 @@ class PolicyNewtonUpdate(EpisodeCollection):
         if self.target_kl is not None and self._fitted_alpha is not None:
             alpha = self._fitted_alpha
         step = take_step(
-            StepTester(self.policy, self.actor, batch),
+            StepTester(self.policy, self.actor, batch, self.max_batch_timesteps),
             model,
             lambda alpha: self._solve(model, alpha),
             alpha,
@@ -195,9 +205,9 @@ class PolicyNewtonUpdate(EpisodeCollection):
             "lambda_min": step.cubic.lambda_min if model.basis is None else model.lambda_min,
             "hessian_vector_products": model.products or step.cubic.products,
             "hessian_shrinkage": model.shrinkage,
-            "n_episodes": batch.n_episodes,
+            "n_episodes": sum(gather_counts(batch.n_episodes)),
             "used_timesteps_fraction": self.rollout_buffer.used_fraction,
-            "explained_variance": explained_variance(batch.values, batch.returns),
+            "explained_variance": _explained_variance(batch),
         }
         if value_loss is not None:
             values["value_loss"] = value_loss
@@ -206,3 +216,10 @@ class PolicyNewtonUpdate(EpisodeCollection):
         for key, value in values.items():
             self.logger.record(f"train/{key}", value)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+
+def _explained_variance(batch: EpisodeBatch) -> float:
+    """Return 1 - Var[R - V] / Var[R] over the steps of all ranks; nan where Var[R] = 0."""
+    variance = mean_and_variance(batch.returns)[1]
+    unexplained = mean_and_variance(batch.returns - batch.values)[1]
+    return 1.0 - unexplained / variance if variance else float("nan")
