@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_crpn import ACRPN, CRPN
+from sb3_crpn.distributed import zoo_options
 
 if TYPE_CHECKING:
     from optuna import Trial
@@ -44,8 +45,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except ModuleNotFoundError as error:
         sys.exit(f'sb3-crpn: {error}; install the extra: pip install "sb3-crpn[zoo]"')
     register()
-    config = _default_config(parsed.options) if parsed.script == "train" else []
-    sys.argv = ["sb3-crpn", parsed.script, *config, *parsed.options]
+    options = parsed.options
+    if parsed.script == "train":
+        options = [*_default_config(options), *zoo_options(options)]
+    sys.argv = ["sb3-crpn", parsed.script, *options]
     rl_zoo3.cli.main()
 
 

@@ -27,7 +27,7 @@ LAYERS = {
     "theory": set(),
     "callbacks": {"base"},
     "__init__": {"crpn", "acrpn", "sosp", "theory", "callbacks"},
-    "zoo": {"crpn", "acrpn", "__init__"},
+    "zoo": {"distributed", "crpn", "acrpn", "__init__"},
 }
 ARRAYS = {"numpy", "scipy", "torch"}
 SB3 = {"stable_baselines3", "gymnasium"}

@@ -201,6 +201,10 @@ def on_both(folder):
     )
     model, _ = continued(folder, normalized())
     results["continued"] = tensors(model)
+    results["options"] = zoo_options(["--env", "Pendulum-v1"])
+    results["seeded"] = zoo_options(["--seed", "3"])
+    with pytest.raises(ValueError, match="-optimize is not allowed with torchrun"):
+        zoo_options(["-optimize"])
     return results
 
 
@@ -310,6 +314,18 @@ def test_two_ranks_go_on_from_one_file_and_so_does_one(two):
     )
     assert model.num_timesteps >= timesteps + 300
     assert not torch.equal(model.policy.action_net.weight, before["action_net.weight"])
+
+
+def test_zoo_runs_have_one_seed_and_one_folder(two):
+    (ours, theirs), (seeded, also) = (
+        [result[name] for result in two[1]] for name in ("options", "seeded")
+    )
+    assert ours[:3] == ["--env", "Pendulum-v1", "--seed"] == theirs[:3]
+    assert ours[3] == theirs[3]
+    assert len(ours) == 4
+    assert theirs[4] == "--log-folder"
+    assert theirs[6:] == ["--eval-freq", "-1", "--save-freq", "-1"]
+    assert seeded[-1] == also[3] == "3"
 
 
 def test_a_killed_rank_ends_the_run_and_leaves_the_checkpoints(two):
