@@ -23,7 +23,7 @@ LAYERS = {
     "base": {"cubic", "parameters", "distributed", "vec_env", "episodes", "curvature"},
     "crpn": {"cubic", "curvature", "base"},
     "acrpn": {"cubic", "distributed", "curvature", "base"},
-    "sosp": {"cubic", "parameters", "distributed", "curvature", "base"},
+    "sosp": {"cubic", "parameters", "distributed", "episodes", "curvature", "base"},
     "theory": set(),
     "callbacks": {"base"},
     "__init__": {"crpn", "acrpn", "sosp", "theory", "callbacks"},
@@ -35,6 +35,7 @@ THIRD_PARTY = {
     "cubic": ARRAYS,
     "parameters": {"torch"},
     "distributed": {"numpy", "torch"},
+    "sosp": {*ARRAYS, *SB3, "matplotlib"},
     "theory": set(),
     "zoo": {*ARRAYS, *SB3, "rl_zoo3", "optuna"},
 }
