@@ -1,0 +1,154 @@
+"""Independent estimates of ∇J and ∇²J from blocks of whole episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from stable_baselines3.common.distributions import kl_divergence
+from stable_baselines3.common.policies import ActorCriticPolicy
+from torch import Tensor
+
+from sb3_crpn.curvature import PairWeights
+from sb3_crpn.curvature.scores import EpisodeGroup, policy_distribution
+from sb3_crpn.episodes import EpisodeBatch
+from sb3_crpn.parameters import ActorParameters
+
+Operator = Callable[[Tensor], Tensor]
+
+# The causal estimator at κ = 1: unbiased (DESIGN section 2)
+UNBIASED = PairWeights("causal", 1.0)
+
+# Up to this d every block's Hessian is written out: d products with each, fewer than the directions
+# and the limits would otherwise take
+DENSE = 16
+
+
+@dataclass(frozen=True)
+class BlockSample:
+    """K independent and identically distributed pairs (g_k, H_k) with means ∇J and ∇²J.
+
+    Block k belongs to half k mod 2; K is even. Ĥ and ĝ are the means over all blocks.
+
+    Attributes
+    ----------
+    gradients
+        g_k, float64 [K, d].
+    block_products
+        X ↦ (H_k x_k)_k, [K, d] to [K, d].
+    half_products
+        v ↦ the mean of H_k v over each half, [d] to [d].
+    implied_product
+        v ↦ Bv, the covariance of g_k that the policy's probabilities imply
+        (:func:`implied_covariance`), [d] to [d].
+    """
+
+    gradients: Tensor
+    block_products: Operator
+    half_products: tuple[Operator, Operator]
+    implied_product: Operator
+
+    @classmethod
+    def from_matrices(cls, gradients: Tensor, hessians: Tensor, implied: Tensor) -> BlockSample:
+        """Return the sample of known g_k [K, d], symmetric H_k [K, d, d] and B [d, d]."""
+        even, odd = hessians[0::2].mean(0), hessians[1::2].mean(0)
+        return cls(
+            gradients,
+            lambda vectors: torch.einsum("kij,kj->ki", hessians, vectors),
+            (lambda vector: even @ vector, lambda vector: odd @ vector),
+            lambda vector: implied @ vector,
+        )
+
+    @classmethod
+    def from_episodes(
+        cls,
+        policy: ActorCriticPolicy,
+        actor: ActorParameters,
+        batch: EpisodeBatch,
+        n_blocks: int,
+        rng: np.random.Generator,
+    ) -> BlockSample:
+        """Deal the episodes at random into ``n_blocks`` blocks of equally many.
+
+        At random, because episodes come in the order in which they ended, which tells of their
+        lengths.
+        """
+        batch = batch.take(rng.permutation(batch.n_episodes))
+        blocks = [EpisodeGroup(policy, actor, part, UNBIASED) for part in batch.split(n_blocks)]
+        even, odd = (EpisodeGroup(policy, actor, part, UNBIASED) for part in batch.split(2))
+        sample = cls(
+            torch.stack([block.gradient() for block in blocks]),
+            lambda vectors: torch.stack(
+                [block.hessian_product(x) for block, x in zip(blocks, vectors, strict=True)]
+            ),
+            (even.hessian_product, odd.hessian_product),
+            implied_covariance(policy, actor, batch, n_blocks),
+        )
+        return sample.written_out() if sample.size <= DENSE else sample
+
+    def written_out(self) -> BlockSample:
+        """Return the same sample with its Hessians as matrices."""
+        identity = torch.eye(self.size, dtype=torch.float64, device=self.gradients.device)
+        hessians = torch.stack([self.products(column) for column in identity], dim=2)
+        implied = torch.stack([self.implied_product(column) for column in identity], dim=1)
+        return self.from_matrices(
+            self.gradients, 0.5 * (hessians + hessians.transpose(1, 2)), implied
+        )
+
+    @property
+    def n_blocks(self) -> int:
+        """The number of blocks, K."""
+        return self.gradients.shape[0]
+
+    @property
+    def size(self) -> int:
+        """The number of parameters, d."""
+        return self.gradients.shape[1]
+
+    def products(self, vector: Tensor) -> Tensor:
+        """Return H_k v for all blocks, [K, d]."""
+        return self.block_products(vector.expand(self.n_blocks, -1))
+
+    def mean_product(self, vector: Tensor) -> Tensor:
+        """Return Ĥv, [d]."""
+        return 0.5 * (self.half_products[0](vector) + self.half_products[1](vector))
+
+    def moment_products(self, vector: Tensor) -> tuple[Tensor, Tensor]:
+        """Return Ĥv and V̂v, V̂ = Σ_k (H_k - Ĥ)² / (K - 1), at the cost of two products, [d] each.
+
+        (H_k - Ĥ)v is multiplied by H_k alone: Ĥ times the sum of these is zero.
+        """
+        products = self.products(vector)
+        mean = products.mean(0)
+        return mean, self.block_products(products - mean).sum(0) / (self.n_blocks - 1)
+
+
+def implied_covariance(
+    policy: ActorCriticPolicy, actor: ActorParameters, batch: EpisodeBatch, n_blocks: int
+) -> Operator:
+    """Return v ↦ Bv, B = (K/E²) Σ_i A_i² F(s_i), F(s) = E_{a~π(·|s)}[σσᵀ].
+
+    E episodes in K blocks. The covariance of Σ_i A_i σ_i over a block's episodes, divided by their
+    number, with the actions averaged out at the probabilities that the policy gives them and A_i²
+    taken not to depend on them. Unlike the sample's covariance it knows of the actions that were
+    not taken.
+    """
+    with torch.no_grad():
+        reference = policy_distribution(policy, batch)
+    divergence = kl_divergence(reference, policy_distribution(policy, batch))
+    per_step = divergence.reshape(batch.n_steps, -1).sum(1)  # dimensions of the action are apart
+    squares = per_step.new_tensor(batch.weights**2)
+    slope = torch.autograd.grad(
+        (squares * per_step).sum(), actor.tensors, create_graph=True, materialize_grads=True
+    )
+
+    def product(vector: Tensor) -> Tensor:
+        along = [(a * b).sum() for a, b in zip(slope, actor.unflatten(vector), strict=True)]
+        curvature = torch.autograd.grad(
+            torch.stack(along).sum(), actor.tensors, retain_graph=True, materialize_grads=True
+        )
+        return actor.flatten(curvature) * n_blocks / batch.n_episodes**2
+
+    return product

@@ -1,0 +1,95 @@
+"""SospCallback: certificates during training."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import sync_envs_normalization
+
+from sb3_crpn.base.arguments import check_flag, check_integer
+from sb3_crpn.sosp.certificate import certify_sosp
+from sb3_crpn.sosp.report import SospReport
+
+
+class SospCallback(BaseCallback):
+    """Certify the policy every ``eval_freq`` calls, and log what comes of it.
+
+    Logs ``sosp/gradient_norm``, ``sosp/lambda_min`` and ``sosp/verdict``, for any SB3 on-policy
+    model. Training goes on as without it: episodes are simulated in an environment of their own,
+    and policy and random generators are left as they were.
+
+    Parameters
+    ----------
+    eval_freq
+        Calls between certificates; a call is one step of all training environments.
+    eval_env
+        Environment to simulate in, wrapped as the training environment is. The statistics of a
+        ``VecNormalize`` are copied over, as ``EvalCallback`` does.
+    n_episodes, epsilon, rho
+        As in :func:`certify_sosp`.
+    stop_at_sosp
+        End training at the first verdict "sosp".
+    seed
+        Of all certificates together.
+    verbose
+        1: print each report.
+    **options
+        Further arguments of :func:`certify_sosp`.
+
+    Attributes
+    ----------
+    report
+        The last :class:`SospReport`, ``None`` before the first.
+    """
+
+    def __init__(
+        self,
+        eval_freq: int,
+        eval_env: GymEnv,
+        n_episodes: int,
+        epsilon: float,
+        rho: float | None = None,
+        *,
+        stop_at_sosp: bool = False,
+        seed: int | None = None,
+        verbose: int = 0,
+        **options: Any,
+    ) -> None:
+        super().__init__(verbose)
+        check_integer("eval_freq", eval_freq, 1)
+        check_flag("stop_at_sosp", stop_at_sosp)
+        self.eval_freq = eval_freq
+        self.eval_env = eval_env
+        self.stop_at_sosp = stop_at_sosp
+        self.report: SospReport | None = None
+        self._arguments = {"n_episodes": n_episodes, "epsilon": epsilon, "rho": rho, **options}
+        self._rng = np.random.default_rng(seed)
+
+    def _init_callback(self) -> None:
+        self._env = self.model._wrap_env(self.eval_env, monitor_wrapper=False)
+
+    def _on_step(self) -> bool:
+        if self.n_calls % self.eval_freq:
+            return True
+        if self.model.get_vec_normalize_env() is not None:
+            sync_envs_normalization(self.training_env, self._env)
+        assert isinstance(self.model, OnPolicyAlgorithm)
+        self.report = certify_sosp(
+            self.model, env=self._env, seed=int(self._rng.integers(2**31)), **self._arguments
+        )
+        self._log(self.report)
+        return not (self.stop_at_sosp and self.report.verdict == "sosp")
+
+    def _log(self, report: SospReport) -> None:
+        if self.verbose:
+            print(report)
+        self.logger.record("sosp/gradient_norm", report.gradient_norm.estimate)
+        self.logger.record("sosp/lambda_min", report.lambda_min.estimate)
+        self.logger.record("sosp/verdict", report.verdict)
+        # dumped at once, as EvalCallback does, for the timestep to be right
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)

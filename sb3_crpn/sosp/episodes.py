@@ -1,0 +1,162 @@
+"""Whole episodes of any SB3 actor-critic policy, which is left exactly as it was."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.utils import obs_as_tensor
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+
+from sb3_crpn.base.collection import ENDLESS, Array
+from sb3_crpn.episodes import (
+    DictEpisodeRolloutBuffer,
+    EpisodeBatch,
+    EpisodeRolloutBuffer,
+    EpisodeTracker,
+    episodes_per_env,
+)
+from sb3_crpn.episodes.batch import episode_time
+
+
+@contextmanager
+def undisturbed(policy: ActorCriticPolicy, env: VecEnv, seed: int) -> Iterator[None]:
+    """Put ``policy`` in evaluation mode on a random stream of its own, then undo all of it.
+
+    Kept are the mode, the action distribution (SB3's policies reuse one object; with gSDE it holds
+    the exploration noise of the rollout in progress), PyTorch's generators, and whether a
+    ``VecNormalize`` learns its statistics.
+    """
+    training, distribution = policy.training, dict(vars(policy.action_dist))
+    normalizer = unwrap_vec_normalize(env)
+    learns = normalizer is not None and normalizer.training
+    devices = [policy.device] if policy.device.type == "cuda" else []
+    with torch.random.fork_rng(devices=devices):
+        try:
+            torch.manual_seed(seed)
+            policy.set_training_mode(False)
+            if normalizer is not None:
+                normalizer.training = False
+            yield
+        finally:
+            policy.set_training_mode(training)
+            vars(policy.action_dist).clear()
+            vars(policy.action_dist).update(distribution)
+            if normalizer is not None:
+                normalizer.training = learns
+
+
+def collect_episodes(
+    policy: ActorCriticPolicy,
+    env: VecEnv,
+    n_episodes: int,
+    *,
+    gamma: float,
+    horizon: int | None = None,
+) -> EpisodeBatch:
+    """Simulate whole episodes of the stochastic policy, a fixed quota from each environment.
+
+    The weights are the costs-to-go, A_i = Ψ_i = -Σ_{h≥i} γ^h r_h: no estimate enters them. A time
+    limit is an episode's end.
+
+    Parameters
+    ----------
+    policy
+        In evaluation mode; its actions are drawn from PyTorch's generator. With gSDE the noise is
+        drawn anew for each step, as π(a|s) has it.
+    env
+        Reset at the start.
+    n_episodes
+        Episodes in all.
+    gamma
+        γ.
+    horizon
+        Steps after which an episode is cut; ``None``: never.
+
+    Raises
+    ------
+    ValueError
+        A reward is not finite, or no episode comes to an end.
+    """
+    buffer = _new_buffer(policy, env.num_envs, gamma)
+    obs, starts = env.reset(), np.ones(env.num_envs, dtype=bool)
+    tracker = EpisodeTracker(episodes_per_env(n_episodes, env.num_envs), starts, horizon)
+    unused = torch.zeros(env.num_envs)
+    last_end = 0
+    while not tracker.complete:
+        actions = _sample(policy, obs, env.num_envs)
+        new_obs, rewards, dones, _ = env.step(_for_environment(policy, actions))
+        buffer.add(obs, actions, rewards, starts, unused, unused)
+        for end in tracker.advance(dones):
+            buffer.close_episode(end, terminal_value=0.0)
+            last_end = buffer.pos
+        obs, starts = new_obs, dones
+        if tracker.stalled:
+            obs, starts = env.reset(), np.ones(env.num_envs, dtype=bool)
+            tracker.restart()
+        if buffer.pos - last_end >= ENDLESS:
+            raise ValueError(
+                f"no episode ended within {ENDLESS} steps, but the estimates need whole episodes: "
+                "wrap the environment in gymnasium.wrappers.TimeLimit"
+            )
+    buffer.compute_advantages()
+    batch = buffer.episode_batch(
+        baseline=False, normalize_advantage=False, discount_visitation=True
+    )
+    if not np.isfinite(batch.weights).all():
+        raise ValueError("the environment returned a non-finite reward; VecCheckNan finds it")
+    return batch
+
+
+def with_baseline(policy: ActorCriticPolicy, batch: EpisodeBatch, gamma: float) -> EpisodeBatch:
+    """Return the batch with A_i = Ψ_i + γ^i V(s_i).
+
+    Unbiased for the gradient and the Hessian, since V, whatever it is, was fitted on other
+    episodes than these (DESIGN section 2).
+    """
+    with torch.no_grad():
+        values = policy.predict_values(batch.observations).flatten().cpu().double().numpy()
+    return replace(batch, weights=batch.weights + gamma ** episode_time(batch.lengths) * values)
+
+
+def _new_buffer(policy: ActorCriticPolicy, n_envs: int, gamma: float) -> EpisodeRolloutBuffer:
+    is_dict = isinstance(policy.observation_space, spaces.Dict)
+    buffer_class: type[EpisodeRolloutBuffer] = (
+        DictEpisodeRolloutBuffer if is_dict else EpisodeRolloutBuffer
+    )
+    return buffer_class(
+        256,  # grows
+        policy.observation_space,
+        policy.action_space,
+        device=policy.device,
+        gamma=gamma,
+        gae_lambda=1.0,
+        n_envs=n_envs,
+    )
+
+
+def _sample(policy: ActorCriticPolicy, obs: Any, n_envs: int) -> Array:
+    with torch.no_grad():
+        if policy.use_sde:
+            policy.reset_noise(n_envs)
+        distribution = policy.get_distribution(obs_as_tensor(obs, policy.device))
+        actions: Array = distribution.get_actions().cpu().numpy()
+    return actions
+
+
+def _for_environment(policy: ActorCriticPolicy, actions: Array) -> Array:
+    """Return the actions as the environment takes them, as SB3's ``predict`` does."""
+    space = policy.action_space
+    if not isinstance(space, spaces.Box):
+        return actions
+    actions = actions.reshape(-1, *space.shape)
+    if policy.squash_output:
+        return policy.unscale_action(actions)
+    clipped: Array = np.clip(actions, space.low, space.high)
+    return clipped

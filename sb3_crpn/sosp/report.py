@@ -1,0 +1,139 @@
+"""What a certificate says, for people and for programs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from torch import Tensor
+
+from sb3_crpn.sosp.inference import Interval
+from sb3_crpn.sosp.spectrum import Spectrum
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Verdict = Literal["sosp", "saddle", "not stationary", "undecided"]
+IntervalMethod = Literal["bootstrap", "bernstein"]
+
+
+@dataclass(frozen=True, eq=False)
+class SospReport:
+    """The certificate of one policy.
+
+    Attributes
+    ----------
+    gradient_norm, lambda_min
+        ‖∇J‖ and λ_min(∇²J) with their confidence intervals, which hold together with probability
+        ``confidence``. The estimates are those of the mean gradient and Hessian: noise makes the
+        first too large and the second too small, as the intervals allow for.
+    epsilon, rho
+        ε and ρ of ‖∇J‖ ≤ ε, λ_min(∇²J) ≥ -√(ρε).
+    confidence, interval
+        1 - δ, and how the intervals were made.
+    n_episodes, n_steps
+        What the estimates rest on.
+    gradient
+        Estimate of ∇J, [d], in the order of ``policy.parameters()`` that log π depends on.
+    escape_direction
+        Unit leftmost eigenvector of the estimated Hessian, [d], its sign such that J does not
+        ascend along it to first order.
+    spectrum
+        Leftmost eigenvalues and spectral density of the estimated Hessian.
+    """
+
+    gradient_norm: Interval
+    lambda_min: Interval
+    epsilon: float
+    rho: float
+    confidence: float
+    interval: IntervalMethod
+    n_episodes: int
+    n_steps: int
+    gradient: Tensor
+    escape_direction: Tensor
+    spectrum: Spectrum
+
+    @property
+    def curvature_threshold(self) -> float:
+        """-√(ρε)."""
+        return -math.sqrt(self.rho * self.epsilon)
+
+    @property
+    def verdict(self) -> Verdict:
+        """What the intervals prove.
+
+        "not stationary": ‖∇J‖ > ε. Else ‖∇J‖ ≤ ε, and "sosp": λ_min ≥ -√(ρε), or "saddle":
+        λ_min < -√(ρε), be it a saddle or a maximum of the cost. "undecided" where a threshold lies
+        inside its interval. A wrong verdict has probability 1 - ``confidence`` at most.
+        """
+        if self.gradient_norm.lower > self.epsilon:
+            return "not stationary"
+        if self.gradient_norm.upper <= self.epsilon:
+            if self.lambda_min.lower >= self.curvature_threshold:
+                return "sosp"
+            if self.lambda_min.upper < self.curvature_threshold:
+                return "saddle"
+        return "undecided"
+
+    def __str__(self) -> str:
+        """Return a few lines for people."""
+        leftmost = ", ".join(f"{value:.3g}" for value in self.spectrum.leftmost)
+        return "\n".join(
+            [
+                f"{self.verdict}: ε = {self.epsilon:g}, ρ = {self.rho:g}, "  # noqa: RUF001
+                f"{self.confidence:.0%} confidence ({self.interval})",
+                f"  ‖∇J‖        {self.gradient_norm}, stationary: ≤ {self.epsilon:.3g}",
+                f"  λ_min(∇²J)  {self.lambda_min}, "
+                f"no escape: ≥ -√(ρε) = {self.curvature_threshold:.3g}",
+                f"  leftmost    {leftmost}",
+                f"  {self.n_episodes} episodes, {self.n_steps} steps, d = {len(self.gradient)}",
+            ]
+        )
+
+    def plot(self) -> Figure:
+        """Draw both intervals with their thresholds, and the spectral density.
+
+        Returns
+        -------
+        Figure
+            Three axes: ‖∇J‖, λ_min(∇²J), density. Needs matplotlib.
+        """
+        from matplotlib.figure import Figure  # an optional dependency
+
+        figure = Figure(figsize=(9.0, 3.4), layout="constrained")
+        axes = figure.subplots(1, 3, width_ratios=[1, 1, 3])
+        _draw_interval(axes[0], self.gradient_norm, self.epsilon, "‖∇J‖", "ε")
+        _draw_interval(
+            axes[1], self.lambda_min, self.curvature_threshold, "$λ_{min}(∇²J)$", "-√(ρε)"
+        )
+        _draw_density(axes[2], self.spectrum, self.curvature_threshold)
+        figure.suptitle(f"{self.verdict} ({self.confidence:.0%} confidence)")
+        return figure
+
+
+def _draw_interval(
+    axes: Axes, interval: Interval, threshold: float, title: str, threshold_name: str
+) -> None:
+    finite = [x for x in (interval.lower, interval.upper) if math.isfinite(x)]
+    axes.plot([0] * len(finite), finite, "_-", color="C0", ms=12)
+    axes.plot(0, interval.estimate, "o", color="C0")
+    axes.axhline(threshold, color="C3", ls="--", lw=1, label=threshold_name)
+    axes.set_title(title, fontsize=10)
+    axes.set_xticks([])
+    axes.legend(fontsize=8)
+
+
+def _draw_density(axes: Axes, spectrum: Spectrum, threshold: float) -> None:
+    low, high = spectrum.values[0], spectrum.values[-1]
+    margin = 0.05 * max(high - low, abs(threshold), 1e-12)
+    points = np.linspace(min(low, threshold) - margin, high + margin, 1000)
+    axes.semilogy(points, spectrum.density(points, width=0.2 * margin), color="C0", lw=1)
+    axes.plot(spectrum.leftmost, [1.0] * len(spectrum.leftmost), "|", color="C1", ms=9)
+    axes.axvline(threshold, color="C3", ls="--", lw=1)
+    axes.set_ylim(bottom=1e-6)
+    axes.set_xlabel("eigenvalue of ∇²J")
+    axes.set_title("spectral density", fontsize=10)

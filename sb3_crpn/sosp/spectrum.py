@@ -1,0 +1,133 @@
+"""The spectrum of a symmetric operator by Lanczos: leftmost eigenpairs and spectral density."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from sb3_crpn.cubic import krylov_basis
+from sb3_crpn.sosp.blocks import Operator
+
+FloatArray = npt.NDArray[np.float64]
+
+# Products of one Lanczos run. On CartPole-v1, 64×64, the leftmost Ritz pair of an untrained and of
+# two trained policies had a residual below 1e-6 of the spectrum's width after 20
+N_STEPS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    r"""What Lanczos from random starts sees of the spectrum of A, [d, d].
+
+    Its density is that of stochastic Lanczos quadrature (Golub and Meurant, Matrices, Moments and
+    Quadrature with Applications, 2010, chapter 11): from a random start, the Ritz values θ_i with
+    the squared first entries τ_i of the Lanczos matrix's eigenvectors give
+
+    .. math:: \tfrac1d \operatorname{tr} f(A) \approx \sum_i \tau_i f(\theta_i), \quad
+              \sum_i \tau_i = 1,
+
+    exactly so, on average over the start, for polynomials f of degree < 2k. For d ≤ k the θ_i are
+    the eigenvalues and τ_i = 1/d.
+
+    Attributes
+    ----------
+    values, weights
+        θ_i, ascending, and τ_i, of all starts together.
+    leftmost
+        The leftmost Ritz values, ascending: the first is accurate to ``residual``, later ones are
+        bounds on the eigenvalues from above.
+    vector
+        Unit Ritz vector v of the leftmost θ, [d].
+    residual
+        ‖Av - θv‖: an eigenvalue is at most so far from θ.
+    """
+
+    values: FloatArray
+    weights: FloatArray
+    leftmost: FloatArray
+    vector: Tensor
+    residual: float
+
+    def density(self, points: FloatArray, width: float) -> FloatArray:
+        """Return Σ_i τ_i N(x; θ_i, width²), the smoothed spectral density at the points x."""
+        deviations = (points[:, None] - self.values) / width
+        kernel = np.exp(-0.5 * deviations**2) / (width * np.sqrt(2.0 * np.pi))
+        density: FloatArray = kernel @ self.weights
+        return density
+
+
+def lanczos_spectrum(
+    operator: Operator,
+    like: Tensor,
+    generator: torch.Generator,
+    *,
+    n_steps: int = N_STEPS,
+    n_probes: int = 1,
+    n_leftmost: int = 1,
+) -> Spectrum:
+    """Run Lanczos with full reorthogonalisation ``n_probes`` times.
+
+    Parameters
+    ----------
+    operator
+        v ↦ Av, A symmetric, float64 [d] to [d].
+    like
+        A vector of v's size, type and device.
+    generator
+        Of the random starts.
+    n_steps
+        k, products of each run. Where d ≤ k one run spans all of ℝᵈ.
+    n_probes
+        Random starts. More of them smooth the density, and each is a chance to see an eigenvector
+        that the others are orthogonal to.
+    n_leftmost
+        Leftmost Ritz values to return, at most.
+    """
+    if like.numel() <= n_steps:
+        n_probes = 1
+    runs = [_run(operator, like, generator, n_steps) for _ in range(n_probes)]
+    values = np.concatenate([run.values for run in runs])
+    order = np.argsort(values)
+    best = min(runs, key=lambda run: run.values[0])
+    return Spectrum(
+        values=values[order],
+        weights=np.concatenate([run.weights for run in runs])[order] / n_probes,
+        leftmost=best.values[:n_leftmost],
+        vector=best.vector,
+        residual=best.residual,
+    )
+
+
+def _run(operator: Operator, like: Tensor, generator: torch.Generator, n_steps: int) -> Spectrum:
+    products: list[Tensor] = []
+
+    def recorded(vector: Tensor) -> Tensor:
+        products.append(operator(vector))
+        return products[-1]
+
+    if like.numel() <= n_steps:
+        basis = torch.eye(like.numel(), dtype=like.dtype, device=like.device)
+        for column in basis:
+            recorded(column)
+    else:
+        start = torch.randn(like.numel(), generator=generator, dtype=like.dtype).to(like.device)
+        basis = krylov_basis(recorded, start, n_steps)
+    images = torch.stack(products, dim=1)  # A·basis
+    projected = basis.T @ images
+    values, rotation = torch.linalg.eigh(0.5 * (projected + projected.T))
+    # the first basis vector is the start; all of ℝᵈ gives each eigenvalue its 1/d
+    full = basis.shape[1] == like.numel()
+    weights = torch.full_like(values, 1.0 / len(values)) if full else rotation[0] ** 2
+    vector = basis @ rotation[:, 0]
+    residual = images @ rotation[:, 0] - values[0] * vector
+    return Spectrum(
+        values.cpu().numpy(),
+        weights.cpu().numpy(),
+        values[:1].cpu().numpy(),
+        vector,
+        float(torch.linalg.vector_norm(residual)),
+    )

@@ -1,0 +1,252 @@
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from sb3_contrib import TRPO
+from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from benchmarks.exact import TabularEnv, assign_actor, coordination_mdp, random_mdp
+from sb3_crpn import ACRPN, CRPN, PAPER
+from sb3_crpn.sosp import SospReport, certify_sosp
+from sb3_crpn.theory import Constants, softmax_linear
+from tests.envs import Sampler
+
+SADDLE = torch.zeros(6, dtype=torch.float64)
+LAMBDA_MIN = -1.5  # at the saddle of the coordination MDP
+
+
+def tabular(mdp, theta, algorithm=PPO, **arguments):
+    """A model whose policy is softmax-linear with the given parameters."""
+    options = {"gamma": mdp.gamma, "policy_kwargs": {"net_arch": []}, "seed": 0, **arguments}
+    model = algorithm("MlpPolicy", TabularEnv(mdp), device="cpu", **options)
+    assign_actor(model.policy, theta)
+    return model
+
+
+def saddle(algorithm=PPO, **arguments):
+    return tabular(coordination_mdp(), SADDLE, algorithm, **arguments)
+
+
+def blind():
+    """An MDP whose best policy is random: states that look alike. The optimum lies inside."""
+    return random_mdp(26, n_states=4, n_observations=1, horizon=4, gamma=1.0)
+
+
+def optimised(mdp, n_steps=300):
+    theta = torch.randn(
+        mdp.n_parameters, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    )
+    for _ in range(n_steps):
+        theta = theta - mdp.gradient(theta)
+    return theta
+
+
+@pytest.mark.parametrize("algorithm", [PPO, A2C, TRPO, CRPN, ACRPN])
+def test_a_strict_saddle_is_told_from_its_episodes(algorithm):
+    report = certify_sosp(saddle(algorithm), 400, epsilon=0.5, rho=1.0, seed=0)
+    assert isinstance(report, SospReport)
+    assert report.verdict == "saddle"
+    assert report.gradient_norm.lower == pytest.approx(0.0, abs=0.2)
+    assert report.lambda_min.lower <= LAMBDA_MIN <= report.lambda_min.upper
+    assert report.curvature_threshold == pytest.approx(-(0.5**0.5))
+    assert report.n_episodes == 400
+    assert report.n_steps == 800
+
+
+def test_the_escape_direction_lowers_the_cost():
+    mdp = coordination_mdp()
+    direction = certify_sosp(saddle(), 200, epsilon=0.5, rho=1.0, seed=0).escape_direction
+    assert direction.norm() == pytest.approx(1.0)
+    assert direction @ mdp.hessian(SADDLE) @ direction < 0.9 * LAMBDA_MIN
+    assert mdp.cost(SADDLE + 0.5 * direction) < mdp.cost(SADDLE) - 0.1
+
+
+def test_the_direction_of_a_slope_does_not_ascend():
+    theta = SADDLE + 0.3 * torch.randn(
+        6, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
+    )
+    report = certify_sosp(tabular(coordination_mdp(), theta), 100, epsilon=0.1, seed=0)
+    assert report.gradient @ report.escape_direction <= 0.0
+
+
+def test_a_steep_policy_is_not_stationary():
+    mdp = random_mdp(1)
+    theta = torch.randn(
+        mdp.n_parameters, dtype=torch.float64, generator=torch.Generator().manual_seed(5)
+    )
+    norm = mdp.gradient(theta).norm().item()
+    report = certify_sosp(tabular(mdp, theta), 1000, epsilon=0.3 * norm, rho=1.0, seed=0)
+    assert report.verdict == "not stationary"
+    assert report.gradient_norm.lower <= norm <= report.gradient_norm.upper
+
+
+def test_an_optimised_policy_is_an_sosp():
+    mdp = blind()
+    theta = optimised(mdp)
+    report = certify_sosp(tabular(mdp, theta), 1000, epsilon=0.5, rho=1.0, seed=0)
+    assert mdp.is_sosp(theta, 0.5, 1.0)
+    assert report.verdict == "sosp"
+
+
+def test_few_episodes_leave_it_undecided():
+    assert certify_sosp(saddle(), 4, epsilon=0.05, rho=1.0, seed=0).verdict == "undecided"
+
+
+@pytest.mark.parametrize("theta", [SADDLE, SADDLE + 0.5])
+def test_estimates_are_unbiased_for_a_biased_training_configuration(theta):
+    """Mean over certificates against the exact derivatives."""
+    mdp = random_mdp(2)
+    theta = theta.new_tensor(np.resize(theta.numpy(), mdp.n_parameters))
+    model = tabular(mdp, theta, CRPN, gae_lambda=0.5, hessian_lambda=0.0)
+    gradients = torch.stack(
+        [certify_sosp(model, 20, epsilon=1.0, seed=seed).gradient for seed in range(20)]
+    )
+    error = gradients.std(0) / 20**0.5
+    assert torch.all((gradients.mean(0) - mdp.gradient(theta)).abs() < 4.5 * error + 1e-6)
+
+
+def test_the_bernstein_intervals_hold_with_the_bounds_of_the_theory():
+    mdp = coordination_mdp()
+    constants = Constants(K=1.0, scores=softmax_linear(2.0**0.5), H=2, d=6)
+    report = certify_sosp(
+        saddle(), 50, 0.5, 1.0, interval="bernstein", bounds=(constants.M_1, constants.M_2), seed=0
+    )
+    assert report.gradient_norm.lower == 0.0
+    assert report.gradient_norm.upper >= mdp.gradient(SADDLE).norm()
+    assert report.lambda_min.lower <= LAMBDA_MIN <= report.lambda_min.upper
+    assert report.verdict == "undecided"  # 50 episodes are few for a bound without assumptions
+
+
+def test_rho_is_the_papers_alpha_or_one():
+    paper = saddle(CRPN, alpha=7.0, n_episodes=4, **PAPER)
+    assert certify_sosp(paper, 4, 0.1).rho == 7.0
+    assert certify_sosp(saddle(CRPN), 4, 0.1).rho == 1.0
+    assert certify_sosp(saddle(), 4, 0.1).rho == 1.0
+    assert certify_sosp(paper, 4, 0.1, rho=2.0).rho == 2.0
+
+
+@pytest.mark.parametrize(
+    "actions",
+    [
+        spaces.Discrete(3),
+        spaces.Box(-1.0, 1.0, (2,)),
+        spaces.MultiDiscrete([2, 3]),
+        spaces.MultiBinary(2),
+    ],
+    ids=lambda space: type(space).__name__,
+)
+@pytest.mark.parametrize("is_dict", [False, True])
+def test_every_space(actions, is_dict):
+    box = spaces.Box(-1.0, 1.0, (3,))
+    observations = spaces.Dict({"x": box, "n": spaces.Discrete(3)}) if is_dict else box
+    policy = "MultiInputPolicy" if is_dict else "MlpPolicy"
+    model = PPO(policy, Sampler(observations, actions), device="cpu", n_steps=8, batch_size=8)
+    report = certify_sosp(model, 6, epsilon=1.0, seed=0)
+    assert np.isfinite(report.lambda_min.estimate)
+    assert len(report.spectrum.leftmost) == 5
+
+
+def test_a_network_of_thousands_of_parameters_is_judged_by_products():
+    model = PPO("MlpPolicy", "CartPole-v1", device="cpu", seed=0)
+    report = certify_sosp(model, 10, epsilon=1.0, n_eigenvalues=3, seed=0)
+    assert len(report.gradient) == 4610
+    v = report.escape_direction
+    estimate = CRPN(
+        "MlpPolicy", "CartPole-v1", device="cpu", seed=0, **{**PAPER, "hessian_estimator": "causal"}
+    ).estimate_curvature(2)
+    assert estimate.hessian.shape == (len(v), len(v))
+    assert len(report.spectrum.leftmost) == 3
+
+
+def test_the_same_seed_gives_the_same_certificate():
+    def certificate(seed):
+        model = saddle()
+        model.get_env().seed(0)
+        return certify_sosp(model, 20, epsilon=0.5, seed=seed)
+
+    first, second, other = certificate(1), certificate(1), certificate(2)
+    assert first.lambda_min == second.lambda_min
+    assert torch.equal(first.gradient, second.gradient)
+    assert not torch.equal(first.gradient, other.gradient)
+
+
+def test_the_model_is_left_as_it_was():
+    model = PPO("MlpPolicy", VecNormalize(DummyVecEnv([lambda: gym.make("CartPole-v1")])), seed=0)
+    before = [p.clone() for p in model.policy.parameters()]
+    state, mean = torch.get_rng_state(), model.env.obs_rms.mean.copy()
+    model.policy.set_training_mode(True)
+    certify_sosp(model, 4, epsilon=1.0)
+    assert model.policy.training
+    assert model.env.training
+    assert all(map(torch.equal, before, model.policy.parameters()))
+    assert torch.equal(state, torch.get_rng_state())
+    np.testing.assert_array_equal(mean, model.env.obs_rms.mean)
+    model.learn(64)
+
+
+class InRollout(BaseCallback):
+    def _on_step(self):
+        with pytest.raises(RuntimeError, match="middle of a rollout"):
+            certify_sosp(self.model, 4, epsilon=1.0)
+        return self.n_calls < 3
+
+
+@pytest.mark.parametrize("algorithm", [PPO, CRPN])
+def test_a_rollout_in_progress_is_not_broken(algorithm):
+    saddle(algorithm).learn(20, InRollout())
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"n_episodes": 3},
+        {"epsilon": 0.0},
+        {"rho": -1.0},
+        {"confidence": 1.0},
+        {"interval": "normal"},
+        {"interval": "bernstein"},
+        {"bounds": (1.0, 1.0)},
+        {"n_eigenvalues": 0},
+        {"n_probes": 0},
+    ],
+    ids=str,
+)
+def test_wrong_arguments_are_named(wrong):
+    arguments = {"n_episodes": 4, "epsilon": 1.0, **wrong}
+    (name,) = wrong
+    with pytest.raises(ValueError, match="bounds" if name == "interval" == "bernstein" else "="):
+        certify_sosp(saddle(), **arguments)
+
+
+def test_models_without_a_stochastic_actor_are_refused():
+    with pytest.raises(ValueError, match="DQNPolicy"):
+        certify_sosp(DQN("MlpPolicy", "CartPole-v1", buffer_size=10), 4, 1.0)
+
+
+def test_environments_of_other_spaces_are_refused():
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        certify_sosp(saddle(), 4, 1.0, env=gym.make("CartPole-v1"))
+
+
+def test_an_endless_episode_is_an_error(monkeypatch):
+    monkeypatch.setattr("sb3_crpn.sosp.episodes.ENDLESS", 30)
+    endless = Sampler(spaces.Box(-1.0, 1.0, (2,)), spaces.Discrete(2), length=10**9)
+    model = PPO("MlpPolicy", endless, device="cpu")
+    with pytest.raises(ValueError, match="no episode ended within 30 steps"):
+        certify_sosp(model, 4, 1.0)
+    horizon = CRPN("MlpPolicy", endless, device="cpu", horizon=5)
+    assert certify_sosp(horizon, 4, 1.0).n_steps == 20
+
+
+def test_the_report_reads_and_draws():
+    report = certify_sosp(saddle(), 400, epsilon=0.5, rho=1.0, seed=0)
+    text = str(report)
+    assert text.startswith("saddle: ε = 0.5")
+    assert "95% confidence (bootstrap)" in text
+    assert f"{report.lambda_min.estimate:.3g}" in text
+    figure = report.plot()
+    assert len(figure.axes) == 3
+    figure.canvas.draw()
