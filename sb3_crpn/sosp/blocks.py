@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from stable_baselines3.common.distributions import kl_divergence
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import Tensor
 
 from sb3_crpn.curvature import PairWeights
-from sb3_crpn.curvature.scores import EpisodeGroup, policy_distribution
+from sb3_crpn.curvature.scores import EpisodeGroup
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.parameters import ActorParameters
-
-Operator = Callable[[Tensor], Tensor]
+from sb3_crpn.sosp.implied import Operator, implied_covariance
 
 # The causal estimator at κ = 1: unbiased (DESIGN section 2)
 UNBIASED = PairWeights("causal", 1.0)
@@ -41,8 +38,7 @@ class BlockSample:
     half_products
         v ↦ the mean of H_k v over each half, [d] to [d].
     implied_product
-        v ↦ Bv, the covariance of g_k that the policy's probabilities imply
-        (:func:`implied_covariance`), [d] to [d].
+        v ↦ Bv, the covariance of g_k that the policy's probabilities imply, [d] to [d].
     """
 
     gradients: Tensor
@@ -68,6 +64,7 @@ class BlockSample:
         actor: ActorParameters,
         batch: EpisodeBatch,
         n_blocks: int,
+        gamma: float,
         rng: np.random.Generator,
     ) -> BlockSample:
         """Deal the episodes at random into ``n_blocks`` blocks of equally many.
@@ -84,7 +81,7 @@ class BlockSample:
                 [block.hessian_product(x) for block, x in zip(blocks, vectors, strict=True)]
             ),
             (even.hessian_product, odd.hessian_product),
-            implied_covariance(policy, actor, batch, n_blocks),
+            implied_covariance(policy, actor, batch, n_blocks, gamma),
         )
         return sample.written_out() if sample.size <= DENSE else sample
 
@@ -123,32 +120,3 @@ class BlockSample:
         products = self.products(vector)
         mean = products.mean(0)
         return mean, self.block_products(products - mean).sum(0) / (self.n_blocks - 1)
-
-
-def implied_covariance(
-    policy: ActorCriticPolicy, actor: ActorParameters, batch: EpisodeBatch, n_blocks: int
-) -> Operator:
-    """Return v ↦ Bv, B = (K/E²) Σ_i A_i² F(s_i), F(s) = E_{a~π(·|s)}[σσᵀ].
-
-    E episodes in K blocks. The covariance of Σ_i A_i σ_i over a block's episodes, divided by their
-    number, with the actions averaged out at the probabilities that the policy gives them and A_i²
-    taken not to depend on them. Unlike the sample's covariance it knows of the actions that were
-    not taken.
-    """
-    with torch.no_grad():
-        reference = policy_distribution(policy, batch)
-    divergence = kl_divergence(reference, policy_distribution(policy, batch))
-    per_step = divergence.reshape(batch.n_steps, -1).sum(1)  # dimensions of the action are apart
-    squares = per_step.new_tensor(batch.weights**2)
-    slope = torch.autograd.grad(
-        (squares * per_step).sum(), actor.tensors, create_graph=True, materialize_grads=True
-    )
-
-    def product(vector: Tensor) -> Tensor:
-        along = [(a * b).sum() for a, b in zip(slope, actor.unflatten(vector), strict=True)]
-        curvature = torch.autograd.grad(
-            torch.stack(along).sum(), actor.tensors, retain_graph=True, materialize_grads=True
-        )
-        return actor.flatten(curvature) * n_blocks / batch.n_episodes**2
-
-    return product

@@ -111,7 +111,9 @@ def certify_sosp(
         batch = collect_episodes(policy, target, n_episodes, gamma=model.gamma, horizon=horizon)
         if interval == "bootstrap":
             batch = with_baseline(policy, batch, model.gamma)
-        sample = BlockSample.from_episodes(policy, _actor(policy, batch), batch, n_blocks, rng)
+        sample = BlockSample.from_episodes(
+            policy, _actor(policy, batch), batch, n_blocks, model.gamma, rng
+        )
         generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
         spectrum = lanczos_spectrum(
             sample.mean_product,

@@ -20,8 +20,8 @@ Each interval has one limit on that side and one on the other.
 Actions that a policy seldom takes may be missing from all episodes, which then agree, on wrong
 values: a policy near to a deterministic one would look stationary. But their probabilities are
 known. The spread of g_k is therefore taken to be no smaller than these imply
-(:func:`~sb3_crpn.sosp.blocks.implied_covariance`), that of H_k is increased by the same factor, and
-beyond a factor of 2 λ_min is given no limits.
+(:func:`~sb3_crpn.sosp.implied.implied_covariance`); that of H_k is increased by the same factor,
+and beyond a factor of 2 λ_min is given no limits.
 
 The two-sided interval of "bernstein" is a ball around the estimate instead.
 """

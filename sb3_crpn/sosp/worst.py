@@ -49,7 +49,8 @@ def worst_curvature(
         size = float(torch.linalg.vector_norm(residual))
         bound = float(values[0]) - penalty
         width = float(torch.linalg.eigvalsh(H)[0]) - bound
-        if size <= _TOLERANCE * width or not space.extend(residual):
+        rounding = 1e-12 * float(torch.linalg.matrix_norm(H))
+        if size <= max(_TOLERANCE * width, rounding) or not space.extend(residual):
             return bound - size
 
 
