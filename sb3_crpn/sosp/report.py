@@ -105,12 +105,10 @@ class SospReport:
         from matplotlib.figure import Figure  # an optional dependency
 
         figure = Figure(figsize=(9.0, 3.4), layout="constrained")
-        axes = figure.subplots(1, 3, width_ratios=[1, 1, 3])
-        _draw_interval(axes[0], self.gradient_norm, self.epsilon, "‖∇J‖", "ε")
-        _draw_interval(
-            axes[1], self.lambda_min, self.curvature_threshold, "$λ_{min}(∇²J)$", "-√(ρε)"
-        )
-        _draw_density(axes[2], self.spectrum, self.curvature_threshold)
+        left, middle, right = figure.subplots(1, 3, width_ratios=[1, 1, 3])
+        _draw_interval(left, self.gradient_norm, self.epsilon, "‖∇J‖", "ε")
+        _draw_interval(middle, self.lambda_min, self.curvature_threshold, "λ_min(∇²J)", "-√(ρε)")
+        _draw_density(right, self.spectrum, self.curvature_threshold)
         figure.suptitle(f"{self.verdict} ({self.confidence:.0%} confidence)")
         return figure
 
@@ -118,22 +116,32 @@ class SospReport:
 def _draw_interval(
     axes: Axes, interval: Interval, threshold: float, title: str, threshold_name: str
 ) -> None:
-    finite = [x for x in (interval.lower, interval.upper) if math.isfinite(x)]
-    axes.plot([0] * len(finite), finite, "_-", color="C0", ms=12)
+    limits = [x for x in (interval.lower, interval.upper) if math.isfinite(x)]
+    axes.plot([0] * len(limits), limits, "_-", color="C0", ms=12)
     axes.plot(0, interval.estimate, "o", color="C0")
-    axes.axhline(threshold, color="C3", ls="--", lw=1, label=threshold_name)
-    axes.set_title(title, fontsize=10)
+    axes.axhline(threshold, color="C3", ls="--", lw=1)
     axes.set_xticks([])
-    axes.legend(fontsize=8)
+    axes.set_title(title, fontsize=10)
+    axes.set_xlabel(f"{interval}\ndashed: {threshold_name} = {threshold:.3g}", fontsize=8)
 
 
 def _draw_density(axes: Axes, spectrum: Spectrum, threshold: float) -> None:
-    low, high = spectrum.values[0], spectrum.values[-1]
-    margin = 0.05 * max(high - low, abs(threshold), 1e-12)
-    points = np.linspace(min(low, threshold) - margin, high + margin, 1000)
-    axes.semilogy(points, spectrum.density(points, width=0.2 * margin), color="C0", lw=1)
-    axes.plot(spectrum.leftmost, [1.0] * len(spectrum.leftmost), "|", color="C1", ms=9)
+    low, high = min(spectrum.values[0], threshold), max(spectrum.values[-1], threshold)
+    margin = 0.05 * max(high - low, 1e-12)
+    points = np.linspace(low - margin, high + margin, 1000)
+    density = spectrum.density(points, width=0.2 * margin)
+    axes.semilogy(points, density, color="C0", lw=1)
     axes.axvline(threshold, color="C3", ls="--", lw=1)
-    axes.set_ylim(bottom=1e-6)
-    axes.set_xlabel("eigenvalue of ∇²J")
+    axes.plot(
+        spectrum.leftmost,
+        [0.04] * len(spectrum.leftmost),
+        "|",
+        color="C1",
+        ms=12,
+        transform=axes.get_xaxis_transform(),
+        label="leftmost",
+    )
+    axes.set_ylim(bottom=1e-7 * density.max())  # far below 1/d of a network's eigenvalues
+    axes.legend(fontsize=8)
     axes.set_title("spectral density", fontsize=10)
+    axes.set_xlabel("eigenvalue of ∇²J")
