@@ -69,8 +69,10 @@ class RandomState(BaseAlgorithm):
             final = pathlib.Path(path)
             if not final.suffix:  # as SB3 does
                 final = pathlib.Path(f"{path}.zip")
+            final.parent.mkdir(parents=True, exist_ok=True)
             partial = final.with_name(f"{final.name}.partial")
-            super().save(partial, exclude, include)
+            with partial.open("wb") as stream:
+                super().save(stream, exclude, include)
             partial.replace(final)
         finally:
             self._saved_random_state = None

@@ -44,7 +44,7 @@ class LocalModel:
 
     def lift(self, coordinates: torch.Tensor) -> torch.Tensor:
         """Return the step s = basis · y, [d]."""
-        return coordinates if self.basis is None else self.basis @ coordinates
+        return coordinates if self.basis is None else self.basis @ coordinates.to(self.basis)
 
 
 def full_model(estimate: CurvatureEstimate, shrinkage: float) -> LocalModel:
@@ -67,7 +67,7 @@ def projected_model(
     dim: int | None,
     shrinkage: float | None,
 ) -> LocalModel:
-    """Return the model on a subspace, with its matrices written out.
+    """Return the model on a subspace, with its matrices written out, on the CPU.
 
     The subspace is ℝᵈ itself (``dim=None``), or the Krylov space K(H, g) of the Euclidean metric,
     or K(F, g) of the Fisher metric. On the last, H = 0 gives TRPO's natural-gradient step by
@@ -85,15 +85,16 @@ def projected_model(
         ω; ``None``: estimated by :func:`james_stein`.
     """
     basis, group_products, fisher_products = _subspace(estimate, damping is not None, dim)
-    gradient = basis.T @ estimate.gradient
-    hessians = all_sum(basis.T @ group_products)  # [K, k, k]
+    # k × k matrices are slow work for a GPU
+    gradient = (basis.T @ estimate.gradient).cpu()
+    hessians = all_sum((basis.T @ group_products).cpu())  # [K, k, k]
     if damping is not None:
         # VᵀFV = QΛQᵀ and s = VQ(Λ + ε)^(-½) y make the M-norm of s the Euclidean norm of y;
         # F ⪰ 0, so that a negative eigenvalue is rounding
-        fisher = all_sum(basis.T @ fisher_products)
+        fisher = all_sum((basis.T @ fisher_products).cpu())
         eigenvalues, vectors = torch.linalg.eigh(0.5 * (fisher + fisher.T))
         whiten = ((eigenvalues.clamp(min=0.0) + damping) ** -0.5)[:, None] * vectors.T
-        basis = basis @ whiten.T
+        basis = basis @ whiten.T.to(basis)
         gradient = whiten @ gradient
         hessians = whiten @ hessians @ whiten.T
     hessians = 0.5 * (hessians + hessians.transpose(1, 2))

@@ -1,0 +1,104 @@
+"""The same on a GPU as on the CPU."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from sb3_crpn import CRPN
+from sb3_crpn.base.critic import fit_critic
+from sb3_crpn.base.trial import StepTester
+from sb3_crpn.cubic import solve_krylov
+from sb3_crpn.curvature import PairWeights, estimate_curvature, full_model, projected_model
+from sb3_crpn.parameters import ActorParameters
+from tests.envs import Drift
+from tests.policies import ACTION_SPACES, frozen_episodes, log_probabilities, small_policy
+from tests.training import TrainLog, all_finite, both, make
+
+pytestmark = [
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
+    pytest.mark.filterwarnings("ignore:You are trying to run .* on the GPU"),
+]
+
+
+def measured(kind, device):
+    """All that an update makes of frozen episodes, brought to the CPU."""
+    policy, _ = small_policy(kind)
+    batch = frozen_episodes(policy, lengths=(3, 1, 4, 2, 5))
+    policy.to(device)
+    batch = replace(
+        batch, observations=batch.observations.to(device), actions=batch.actions.to(device)
+    )
+    actor = ActorParameters.reachable(policy, log_probabilities(policy, batch))
+    results = {}
+    for max_steps in (None, 5):
+        estimate = estimate_curvature(
+            policy, actor, batch, batch, PairWeights("causal", 0.9), max_steps
+        )
+        v = torch.linspace(-1.0, 1.0, len(actor), dtype=torch.float64)
+        results |= {
+            f"gradient {max_steps}": estimate.gradient,
+            f"hessian {max_steps}": estimate.hessian @ v.to(device),
+            f"fisher {max_steps}": estimate.fisher @ v,
+            f"dense {max_steps}": estimate.hessian.to_dense(),
+        }
+        models = [
+            projected_model(estimate, damping=0.1, dim=5, shrinkage=None),
+            projected_model(estimate, damping=None, dim=None, shrinkage=0.5),
+            full_model(estimate, 1.0),
+        ]
+        steps = [
+            model.lift(solve_krylov(model.gradient, model.product, 10.0).step) for model in models
+        ]
+        tester = StepTester(policy, actor, batch, max_steps)
+        for number, step in enumerate(steps):
+            trial = tester.try_step(step)
+            effect = torch.tensor([trial.kl, trial.surrogate_change])
+            results |= {f"step {number} {max_steps}": step, f"trial {number} {max_steps}": effect}
+        tester.restore()
+    options = {"n_epochs": 2, "batch_size": 4, "rng": np.random.default_rng(0)}
+    results["loss"] = torch.tensor(fit_critic(policy, actor, batch, **options))
+    results["policy"] = torch.nn.utils.parameters_to_vector(policy.parameters()).detach()
+    return {name: tensor.cpu() for name, tensor in results.items()}
+
+
+@pytest.mark.parametrize("kind", ACTION_SPACES)
+def test_frozen_episodes_give_what_they_give_on_the_cpu(kind):
+    ours, expected = measured(kind, "cuda"), measured(kind, "cpu")
+    for name, value in expected.items():
+        torch.testing.assert_close(ours[name], value, rtol=1e-6, atol=1e-9, msg=name)
+
+
+@both
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {},
+        {"metric": "euclidean", "target_kl": None, "hessian_shrinkage": None},
+        {"metric": "euclidean", "krylov_dim": 4, "max_batch_timesteps": 20},
+    ],
+)
+def test_training_saving_and_loading(algorithm, arguments, tmp_path):
+    model = make(algorithm, Drift(dim=1), device="cuda", alpha=10.0, **arguments)
+    log = TrainLog()
+    model.learn(200, log)
+    assert {p.device.type for p in model.policy.parameters()} == {"cuda"}
+    assert all_finite(model)
+    assert len(log.rows) > 2
+    model.save(tmp_path / "model")
+    for device in ("cpu", "cuda"):
+        loaded = algorithm.load(tmp_path / "model", Drift(dim=1), device=device)
+        assert torch.equal(loaded.actor.vector.cpu(), model.actor.vector.cpu())
+        loaded.learn(100, reset_num_timesteps=False)
+        assert all_finite(loaded)
+
+
+def test_a_loaded_model_goes_on_with_the_noise_where_it_stopped(tmp_path):
+    model = make(CRPN, device="cuda").learn(50)
+    model.save(tmp_path / "model")
+    state = torch.cuda.get_rng_state()
+    loaded = CRPN.load(tmp_path / "model", Drift(), device="cuda")
+    assert not torch.equal(torch.cuda.get_rng_state(), state)
+    loaded.learn(0, reset_num_timesteps=False)
+    assert torch.equal(torch.cuda.get_rng_state(), state)
