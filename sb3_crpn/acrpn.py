@@ -86,7 +86,7 @@ class ACRPN(PolicyNewtonAlgorithm):
         n_rollout_steps: int,
     ) -> bool:
         """Collect whole episodes, unless the last update found an ε-SOSP and is to be the last."""
-        if self.stop_at_sosp and self._at_sosp:
+        if self.stop_at_sosp and bool(broadcast(torch.tensor(self._at_sosp))):
             return False
         return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
 
