@@ -1,6 +1,6 @@
 """Peak memory, of fresh processes."""
 
-import re
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -13,12 +13,12 @@ LIMIT = 3072 * TIMESTEPS / 1_000_000
 
 def growth(*options):
     """MiB that an update adds to what is there before the first rollout."""
-    command = [sys.executable, "-m", "benchmarks.memory", f"--timesteps={TIMESTEPS}"]
+    command = [sys.executable, "-m", "benchmarks.speed.memory", f"--timesteps={TIMESTEPS}"]
     done = subprocess.run(
         [*command, "--krylov-dim=2", *options], cwd=ROOT, capture_output=True, text=True, check=True
     )
-    before, peak = map(int, re.findall(r"peak memory.*: (\d+) MiB", done.stdout))
-    return peak - before
+    row = json.loads(done.stdout)
+    return row["peak"] - row["before"]
 
 
 def test_memory_is_bounded_where_batches_are_split():

@@ -1,0 +1,7 @@
+"""What second order costs, in ratios to what a gradient, TRPO or SB3 costs in the same run."""
+
+import os
+
+# One thread: NumPy and torch read these once, when they are first imported
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")

@@ -1,0 +1,104 @@
+"""Measure what second order costs, as ratios within one run; print tables.
+
+    python -m benchmarks.speed                      # all parts
+    python -m benchmarks.speed products updates     # these alone; the others' results stay
+    python -m benchmarks.speed --table              # print, measure nothing
+
+Every part replaces its own results in the JSON file when it is done.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import re
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.speed import (
+    collection,
+    device,
+    memory,
+    products,
+    scaling,
+    solves,
+    training,
+    updates,
+)
+from benchmarks.speed.tables import part_report, report
+from benchmarks.speed.timing import Row
+
+PARTS: dict[str, Callable[..., list[Row]]] = {
+    "products": products.measure,
+    "updates": updates.measure,
+    "collection": collection.measure,
+    "training": training.measure,
+    "solves": solves.measure,
+    "scaling": scaling.measure,
+    "memory": memory.measure,
+    "device": device.measure,
+}
+JSON = Path(__file__).with_name("speed.json")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the parts asked for, or print what there is."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.speed",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}")
+    parser.add_argument("--json", type=Path, default=JSON, metavar="FILE", help="the results")
+    parser.add_argument("--table", action="store_true", help="print the results' tables")
+    parser.add_argument("--repeats", type=int, help="turns of each task; default: each part's own")
+    args = parser.parse_args(arguments)
+    if unknown := [part for part in args.parts if part not in PARTS]:
+        parser.error(f"{', '.join(unknown)} is no part, must be of {', '.join(PARTS)}")
+    if args.table:
+        print(report(_read(args.json)))
+        return
+    sizes = {} if args.repeats is None else {"repeats": args.repeats}
+    for part in args.parts or PARTS:
+        run_part(part, args.json, **sizes)
+
+
+def run_part(part: str, file: Path, **sizes: Any) -> None:
+    """Measure a part, put its results into the file in place of earlier ones, and print them."""
+    start = time.perf_counter()
+    rows = PARTS[part](**sizes)
+    result = {"machine": machine(), "seconds": time.perf_counter() - start, "rows": rows}
+    results = _read(file) | {part: result}
+    file.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    print(part_report(part, result), end="\n\n", flush=True)
+
+
+def machine() -> dict[str, str]:
+    """Return what the times depend on, besides the code."""
+    found = {"processor": _processor()}
+    if torch.cuda.is_available():
+        found["gpu"] = torch.cuda.get_device_name()
+    found["python"] = f"Python {platform.python_version()}"
+    packages = ("torch", "numpy", "stable-baselines3", "sb3-contrib")
+    return found | {name: f"{name} {version(name)}" for name in packages}
+
+
+def _processor() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.exists() and (found := re.search(r"model name\s*: (.*)", info.read_text())):
+        return found[1]
+    return platform.processor() or platform.machine()
+
+
+def _read(file: Path) -> dict[str, Any]:
+    return dict(json.loads(file.read_text(encoding="utf-8"))) if file.exists() else {}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""Markdown tables of the measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from benchmarks.speed.timing import CLOCKS, Row
+
+# Keys of a comparison's row that are not its case
+_RESULTS = ("unit", "repeats", "ms", "ratio")
+
+TITLES = {
+    "products": "Products, in gradients",
+    "updates": "Updates, in TRPO's",
+    "collection": "Collection, per simulated step, in SB3's",
+    "training": "Training, per timestep, in TRPO's",
+    "solves": "Solves of random cubic models",
+    "scaling": "Cost against T and d",
+    "memory": "Peak memory above what is there before, MiB",
+    "device": "GPU against CPU",
+}
+
+
+def report(results: dict[str, Any]) -> str:
+    """Return the tables of all parts that there are."""
+    return "\n\n".join(part_report(part, results[part]) for part in TITLES if part in results)
+
+
+def part_report(part: str, result: Row) -> str:
+    """Return title, machine and tables of one part."""
+    machine = ", ".join(f"{value}" for value in result["machine"].values())
+    return "\n\n".join([f"## {TITLES[part]}", f"{machine}; {result['seconds']:.0f} s.",
+                        *_tables(part, result["rows"])])  # fmt: skip
+
+
+def _tables(part: str, rows: list[Row]) -> Iterable[str]:
+    if "skipped" in rows[0]:
+        yield f"Skipped: {rows[0]['skipped']}."
+    elif part == "scaling":
+        yield from (_scaling(row) for row in rows)
+    elif part == "memory":
+        yield _memory(rows)
+    elif part == "solves":
+        yield _comparisons(rows[:-1])
+        yield _large_solves(rows[-1])
+    else:
+        yield _comparisons(rows)
+
+
+def _comparisons(rows: list[Row]) -> str:
+    """One line a comparison and clock: the case, the unit's ms, and the ratios to it."""
+    case = [key for key in rows[0] if key not in _RESULTS]
+    unit, names = rows[0]["unit"], list(rows[0]["ratio"])
+    head = [*case, "clock", f"{unit}, ms", *(f"{name} / {unit}" for name in names)]
+    body = [
+        [
+            *(row[key] for key in case),
+            clock,
+            number(row["ms"][unit][clock][0]),
+            *(interval(row["ratio"][name][clock]) for name in names),
+        ]
+        for row in rows
+        for clock in CLOCKS
+    ]
+    return markdown(head, body)
+
+
+def _scaling(row: Row) -> str:
+    """One line a size, with CPU times; the last lines hold the fitted slopes."""
+    tasks = {name: clocks["cpu"] for name, clocks in row["tasks"].items()}
+    body: list[list[Any]] = [
+        [
+            f"{size}{', cut' if row['cut'][i] else ''}",
+            *(number(task["ms"][i][0]) for task in tasks.values()),
+        ]
+        for i, size in enumerate(row["sizes"])
+    ]
+    labels = {"slope": "slope", "last slope": "slope of the last two"}
+    body += [
+        [label, *(interval(task[key]) for task in tasks.values())] for key, label in labels.items()
+    ]
+    return markdown([row["over"], *(f"{name}, CPU ms" for name in tasks)], body)
+
+
+def _large_solves(row: Row) -> str:
+    lines = zip(row["sizes"], row["products"], row["certified"], row["ms"], strict=True)
+    body: list[list[Any]] = [[d, n, ok, number(ms[0])] for d, n, ok, ms in lines]
+    body.append(["slope", "", "", interval(row["slope"])])
+    return markdown(["d", "products", "certified", "krylov, CPU ms"], body)
+
+
+def _memory(rows: list[Row]) -> str:
+    """One line a problem, one column a task."""
+    names = list(dict.fromkeys(row["task"] for row in rows))
+    lines: dict[tuple[Any, ...], dict[str, float]] = {}
+    for row in rows:
+        case = row["timesteps"], row["d"], row["max_batch_timesteps"] or "whole"
+        lines.setdefault(case, {})[row["task"]] = row["growth"]
+    body = [
+        [*case, *(f"{growth[name]:.0f}" if name in growth else "" for name in names)]
+        for case, growth in lines.items()
+    ]
+    return markdown(["T", "d", "batch", *names], body)
+
+
+def number(value: float) -> str:
+    """Return three significant digits, without an exponent."""
+    return f"{value:.0f}" if value >= 100 else f"{value:#.3g}"
+
+
+def interval(estimate: Sequence[float]) -> str:
+    """Return "median [low, high]"."""
+    middle, low, high = estimate
+    return f"{middle:.2f} [{low:.2f}, {high:.2f}]"
+
+
+def markdown(head: Sequence[Any], body: Iterable[Sequence[Any]]) -> str:
+    """Return a table."""
+    lines = [head, ["---"] * len(head), *body]
+    return "\n".join(f"| {' | '.join(_cell(cell) for cell in line)} |" for line in lines)
+
+
+def _cell(value: Any) -> str:
+    return number(value) if isinstance(value, float) else str(value)
