@@ -19,6 +19,9 @@ from sb3_crpn.parameters import ActorParameters
 # them would run smaller, less efficient products.
 N_GROUPS = 2
 
+# VᵀBV of more columns is made from products, whose memory does not grow with columns × timesteps
+MAX_FORM_COLUMNS = 128
+
 
 class NoiseGroups:
     """The episodes of all ranks, dealt in turn to K groups, of which this rank holds a part.
@@ -69,15 +72,17 @@ class NoiseGroups:
         self,
         quantity: Callable[[EpisodeGroup], torch.Tensor],
         unit: Literal["n_episodes", "n_steps"],
+        shape: tuple[int, ...] | None = None,
     ) -> torch.Tensor:
-        """Return this rank's parts of the groups' means of ``quantity``, [K, d].
+        """Return this rank's parts of the groups' means of ``quantity``, [K, d] or [K, *shape].
 
         The parts of all ranks add up to the means. ``quantity`` is itself a mean over the episodes
         or the steps of what it is given.
         """
+        zero = self._zero if shape is None else self._zero.new_zeros(shape)
         return torch.stack(
             [
-                self._mean(runs, quantity, unit, size)
+                self._mean(runs, quantity, unit, size, zero)
                 for runs, size in zip(self._groups, getattr(self, unit).tolist(), strict=True)
             ]
         )
@@ -88,8 +93,8 @@ class NoiseGroups:
         quantity: Callable[[EpisodeGroup], torch.Tensor],
         unit: str,
         size: float,
+        total: torch.Tensor,
     ) -> torch.Tensor:
-        total = self._zero
         for open_run in runs:
             group = open_run()
             total = total + quantity(group) * (getattr(group.batch, unit) / size)
@@ -111,6 +116,9 @@ class EpisodeOperator:
         B_k v.
     sizes
         What w_k is proportional to, [K]: the group's episodes, or its steps, over all ranks.
+    group_forms
+        V ↦ this rank's parts of VᵀB_k V, float64 [d, n] to [K, n, n], where there is a cheaper way
+        to them than products for a few columns.
     """
 
     def __init__(
@@ -118,10 +126,12 @@ class EpisodeOperator:
         size: int,
         group_products: Callable[[torch.Tensor], torch.Tensor],
         sizes: torch.Tensor,
+        group_forms: Callable[[torch.Tensor], torch.Tensor] | None = None,
     ) -> None:
         self.shape = (size, size)
         self.group_products = group_products
         self.weights = sizes / sizes.sum()
+        self._group_forms = group_forms
 
     def __matmul__(self, other: torch.Tensor) -> torch.Tensor:
         """Return B v for v of shape [d], or B V for V of shape [d, n]; float64."""
@@ -135,6 +145,13 @@ class EpisodeOperator:
             return all_sum(self.mean(self.group_products(other)))
         columns = [self.mean(self.group_products(column)) for column in other.T]
         return all_sum(torch.stack(columns, dim=1))
+
+    def group_forms(self, basis: torch.Tensor) -> torch.Tensor:
+        """Return this rank's parts of VᵀB_k V for V = ``basis``, [d, n] to [K, n, n]."""
+        if self._group_forms is not None and basis.shape[1] <= MAX_FORM_COLUMNS:
+            return self._group_forms(basis)
+        columns = [self.group_products(column) for column in basis.T]
+        return basis.T @ torch.stack(columns, dim=2)
 
     def mean(self, groups: torch.Tensor) -> torch.Tensor:
         """Return Σ_k w_k x_k for x_k of any shape, [K, …] to […], on this rank alone."""
@@ -210,6 +227,9 @@ def estimate_curvature(
             len(actor),
             lambda v: of_hessian.means(lambda group: group.hessian_product(v), "n_episodes"),
             of_hessian.n_episodes,
+            lambda V: of_hessian.means(
+                lambda group: group.hessian_form(V), "n_episodes", (V.shape[1], V.shape[1])
+            ),
         ),
         fisher=EpisodeOperator(
             len(actor),

@@ -84,14 +84,14 @@ def projected_model(
     shrinkage
         ω; ``None``: estimated by :func:`james_stein`.
     """
-    basis, group_products, fisher_products = _subspace(estimate, damping is not None, dim)
+    basis, hessian_forms, fisher_form = _subspace(estimate, damping is not None, dim)
     # k × k matrices are slow work for a GPU
     gradient = (basis.T @ estimate.gradient).cpu()
-    hessians = all_sum((basis.T @ group_products).cpu())  # [K, k, k]
+    hessians = all_sum(hessian_forms.cpu())  # [K, k, k]
     if damping is not None:
         # VᵀFV = QΛQᵀ and s = VQ(Λ + ε)^(-½) y make the M-norm of s the Euclidean norm of y;
         # F ⪰ 0, so that a negative eigenvalue is rounding
-        fisher = all_sum((basis.T @ fisher_products).cpu())
+        fisher = all_sum(fisher_form.cpu())
         eigenvalues, vectors = torch.linalg.eigh(0.5 * (fisher + fisher.T))
         whiten = ((eigenvalues.clamp(min=0.0) + damping) ** -0.5)[:, None] * vectors.T
         basis = basis @ whiten.T.to(basis)
@@ -119,21 +119,21 @@ def projected_model(
 def _subspace(
     estimate: CurvatureEstimate, fisher: bool, dim: int | None
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return an orthonormal basis V [d, k], and this rank's parts of H_k V [K, d, k] and F V."""
-    hessian, metric = _Recorder(estimate.hessian), _Recorder(estimate.fisher)
-    generator_of_basis = metric if fisher else hessian
+    """Return an orthonormal basis V [d, k], and this rank's parts of VᵀH_k V [K, k, k] and VᵀFV.
+
+    The basis comes with products with the operator that generates it; the other's are not needed.
+    """
+    recorder = _Recorder(estimate.fisher if fisher else estimate.hessian)
     if dim is None:
         size = estimate.hessian.shape[0]
         basis = torch.eye(size, dtype=torch.float64, device=estimate.gradient.device)
+        forms = recorder.operator.group_forms(basis)
     else:
-        basis = krylov_basis(generator_of_basis, _start(estimate.gradient), dim)
-    for recorder in (hessian, metric) if fisher else (hessian,):
-        if not recorder.columns:
-            recorder.columns = [recorder.operator.group_products(column) for column in basis.T]
-    products = torch.stack(hessian.columns, dim=2)
+        basis = krylov_basis(recorder, _start(estimate.gradient), dim)
+        forms = basis.T @ torch.stack(recorder.columns, dim=2)
     if not fisher:
-        return basis, products, basis
-    return basis, products, estimate.fisher.mean(torch.stack(metric.columns, dim=2))
+        return basis, forms, torch.eye(basis.shape[1], dtype=torch.float64)
+    return basis, estimate.hessian.group_forms(basis), estimate.fisher.mean(forms)
 
 
 def _start(gradient: torch.Tensor) -> torch.Tensor:

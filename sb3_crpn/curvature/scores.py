@@ -55,7 +55,7 @@ class PairWeights:
     decay: float = 1.0
 
     def apply(self, weights: FloatArray, lengths: IntArray, u: FloatArray) -> FloatArray:
-        """Return w_i = Σ_j W_ij u_j, the sum over j within the episode of i, [T].
+        """Return w_i = Σ_j W_ij u_j, the sum over j within the episode of i, [T] or [T, k].
 
         Parameters
         ----------
@@ -64,8 +64,9 @@ class PairWeights:
         lengths
             Steps of each episode, [E].
         u
-            u_j, [T].
+            u_j, [T], or k such vectors, [T, k].
         """
+        weights = weights.reshape(-1, *[1] * (u.ndim - 1))
         if self.estimator == "trajectory":
             return 0.5 * (
                 weights * _episode_totals(u, lengths) + _episode_totals(weights * u, lengths)
@@ -78,9 +79,9 @@ class PairWeights:
 
 
 def _episode_totals(values: FloatArray, lengths: IntArray) -> FloatArray:
-    """Return for each step the sum of ``values`` over its episode, [T]."""
-    totals: FloatArray = np.add.reduceat(values, episode_starts(lengths))
-    return totals.repeat(lengths)
+    """Return for each step the sum of ``values`` over its episode, [T] or [T, k]."""
+    totals: FloatArray = np.add.reduceat(values, episode_starts(lengths), axis=0)
+    return totals.repeat(lengths, axis=0)
 
 
 class EpisodeGroup:
@@ -155,11 +156,7 @@ class EpisodeGroup:
         With u = Jv and w = Wu, J = ∂log π/∂θ, this is (1/n)[Jᵀw + ∇(Σ_i A_i σ_i·v)]. Because
         Σ A_i σ_i·v is linear in A, one backward pass gives both u and the second term.
         """
-        weights, score = self._weighted_score
-        along = _inner(score, self._actor.unflatten(vector))
-        u, *curvature = torch.autograd.grad(
-            along, (weights, *self._actor.tensors), retain_graph=True, materialize_grads=True
-        )
+        u, curvature = self._along(vector)
         w = self._pair_weights.apply(
             self.batch.weights, self.batch.lengths, u.to("cpu", torch.float64).numpy()
         )
@@ -170,8 +167,32 @@ class EpisodeGroup:
             retain_graph=True,
             materialize_grads=True,
         )
-        total = self._actor.flatten(outer) + self._actor.flatten(curvature)
-        return total / self.batch.n_episodes
+        return (self._actor.flatten(outer) + curvature) / self.batch.n_episodes
+
+    def hessian_form(self, basis: torch.Tensor) -> torch.Tensor:
+        """Return VᵀHV for V = ``basis`` [d, k], H as in :meth:`hessian_product`, [k, k].
+
+        Half the backward passes of k products: with U = JV the first term is UᵀWU, which needs no
+        Jᵀ.
+        """
+        u, curvature = (
+            torch.stack(columns, dim=1)
+            for columns in zip(*(self._along(vector) for vector in basis.T), strict=True)
+        )
+        U = u.to("cpu", torch.float64).numpy()
+        outer = U.T @ self._pair_weights.apply(self.batch.weights, self.batch.lengths, U)
+        return (torch.from_numpy(outer).to(basis) + basis.T @ curvature) / self.batch.n_episodes
+
+    def _along(self, vector: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return u = Jv, [T], and ∇(Σ_i A_i σ_i·v), [d], by one backward pass."""
+        weights, score = self._weighted_score
+        u, *curvature = torch.autograd.grad(
+            _inner(score, self._actor.unflatten(vector)),
+            (weights, *self._actor.tensors),
+            retain_graph=True,
+            materialize_grads=True,
+        )
+        return u, self._actor.flatten(curvature)
 
     def fisher_product(self, vector: torch.Tensor) -> torch.Tensor:
         """Return Fv, F = (1/kT) Σ_i E_{a~π(·|s_i)}[σσᵀ] for actions of k components, [d].

@@ -138,6 +138,13 @@ def test_batches_that_do_not_fit_are_accumulated(kind, max_steps, monkeypatch):
             torch.testing.assert_close(products, expected, **exactly)
             assert passes  # built anew
             assert max(passes) <= max(max_steps, 5)
+    V = torch.stack([v, v.flip(0)], dim=1)
+    expected = whole.hessian.group_forms(V)
+    passes.clear()
+    torch.testing.assert_close(split.hessian.group_forms(V), expected, **exactly)
+    assert sum(passes) == batch.n_steps  # one pass over the batch for all columns
+    monkeypatch.setattr("sb3_crpn.curvature.estimate.MAX_FORM_COLUMNS", 1)
+    torch.testing.assert_close(split.hessian.group_forms(V), expected, **exactly)
     assert split.gradient_noise == pytest.approx(whole.gradient_noise, rel=1e-12)
 
 

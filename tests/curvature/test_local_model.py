@@ -80,10 +80,11 @@ def test_leftmost_eigenvalue_is_that_of_the_unshrunk_hessian(estimate, damping):
 def test_products_spent_are_those_counted(monkeypatch, damping, dim):
     estimate = estimate_of()
     spent = []
-    products = estimate.hessian.group_products
+    products, forms = estimate.hessian.group_products, estimate.hessian.group_forms
     monkeypatch.setattr(
         estimate.hessian, "group_products", lambda v: spent.append(1) or products(v)
     )
+    monkeypatch.setattr(estimate.hessian, "group_forms", lambda V: spent.extend(V[0]) or forms(V))
     model = projected_model(estimate, damping=damping, dim=dim, shrinkage=None)
     assert len(spent) == model.products == model.basis.shape[1] <= len(estimate.gradient)
 

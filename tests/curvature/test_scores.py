@@ -55,6 +55,16 @@ def test_pair_weights_are_the_explicit_matrix(lengths, case, seed):
     )
 
 
+@pytest.mark.parametrize("case", ESTIMATORS)
+def test_pair_weights_take_several_vectors_at_once(case):
+    lengths = np.array([3, 1, 4])
+    weights, *u = np.random.default_rng(0).normal(size=(4, 8))
+    W = PairWeights(*case)
+    expected = np.stack([W.apply(weights, lengths, column) for column in u], axis=1)
+    applied = W.apply(weights, lengths, np.stack(u, axis=1))
+    np.testing.assert_allclose(applied, expected, rtol=1e-12, atol=1e-14)
+
+
 @pytest.mark.parametrize("kind", ACTION_SPACES)
 def test_gradient_is_the_weighted_sum_of_scores(kind):
     policy, actor, batch, group = group_of(kind)
@@ -70,6 +80,9 @@ def test_products_are_those_of_the_dense_hessian(kind, case):
     torch.testing.assert_close(product, product.T, rtol=0, atol=1e-12)
     expected = dense_hessian(policy, actor, batch, *case)
     torch.testing.assert_close(product, expected, rtol=1e-10, atol=1e-12)
+    V = torch.randn(len(actor), 3, dtype=torch.float64)
+    form = group.hessian_form(V)
+    torch.testing.assert_close(form, V.T @ expected @ V, rtol=1e-10, atol=1e-11)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -134,6 +147,9 @@ def test_one_forward_pass_serves_all_products_at_two_backward_passes_each(monkey
     for _ in range(5):
         group.fisher_product(torch.randn(len(actor), dtype=torch.float64))
     assert calls == {"forward": 2, "backward": 1 + 2 * 5 + 1 + 5}
+    calls["backward"] = 0
+    group.hessian_form(torch.randn(len(actor), 5, dtype=torch.float64))
+    assert calls == {"forward": 2, "backward": 5}
 
 
 @pytest.mark.parametrize("kind", KINDS)
