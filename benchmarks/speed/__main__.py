@@ -32,7 +32,7 @@ from benchmarks.speed import (
     updates,
 )
 from benchmarks.speed.tables import part_report, report
-from benchmarks.speed.timing import Row
+from benchmarks.speed.timing import Row, one_thread
 
 PARTS: dict[str, Callable[..., list[Row]]] = {
     "products": products.measure,
@@ -72,7 +72,8 @@ def main(arguments: list[str] | None = None) -> None:
 def run_part(part: str, file: Path, **sizes: Any) -> None:
     """Measure a part, put its results into the file in place of earlier ones, and print them."""
     start = time.perf_counter()
-    rows = PARTS[part](**sizes)
+    with one_thread():
+        rows = PARTS[part](**sizes)
     result = {"machine": machine(), "seconds": time.perf_counter() - start, "rows": rows}
     results = _read(file) | {part: result}
     file.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
