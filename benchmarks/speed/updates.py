@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import inspect
 import warnings
-from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -26,7 +25,8 @@ from sb3_crpn.base import PolicyNewtonAlgorithm
 WARM_UP_ROLLOUTS = 3
 
 # What training changes besides networks and optimiser: numbers, and what is kept of the past
-_MUTABLE = (bool, int, float, type(None), deque)
+_MUTABLE = (bool, int, float, type(None))
+_PAST = ("earlier_rollouts",)
 
 
 def measure(repeats: int = 20, n_steps: int = 2048, n_envs: int = 2) -> list[Row]:
@@ -81,7 +81,8 @@ def prepare(
         trpo = TRPO("MlpPolicy", env(), n_steps=leader.n_steps, **critic, **common)
     followers = [ACRPN("MlpPolicy", env(), **common, **arguments), trpo]
     callbacks = {model: model._setup_learn(1)[1] for model in (leader, *followers)}
-    for number in range(WARM_UP_ROLLOUTS + 1):
+    warm_ups = max(WARM_UP_ROLLOUTS, getattr(leader, "n_reused_rollouts", 0))
+    for number in range(warm_ups + 1):
         for _ in range(2 if number == 0 else 1):  # the first tells how long the episodes are
             leader.collect_rollouts(
                 leader.env, callbacks[leader], leader.rollout_buffer, leader.n_steps
@@ -93,7 +94,7 @@ def prepare(
                 if isinstance(model, PolicyNewtonAlgorithm)
                 else _as_sb3(leader, model)
             )
-        if number < WARM_UP_ROLLOUTS:
+        if number < warm_ups:
             for model in (*followers, leader):
                 model.train()
     return {"TRPO": trpo, "CRPN": leader, "ACRPN": followers[0]}
@@ -129,14 +130,15 @@ def update_task(model: OnPolicyAlgorithm, *, critic: bool) -> Task:
     """Return ``model.train()`` from the state in which the model is now."""
     policy = copy.deepcopy(model.policy.state_dict())
     optimizer = copy.deepcopy(model.policy.optimizer.state_dict())
-    state = {k: copy.copy(v) for k, v in vars(model).items() if isinstance(v, _MUTABLE)}
+    state = {k: v for k, v in vars(model).items() if isinstance(v, _MUTABLE) or k in _PAST}
+    state = copy.deepcopy(state)
     if not critic:
         state["n_critic_updates"] = 0
 
     def restore() -> None:
         model.policy.load_state_dict(policy)
         model.policy.optimizer.load_state_dict(optimizer)
-        vars(model).update({k: copy.copy(v) for k, v in state.items()})
+        vars(model).update(copy.deepcopy(state))
 
     def run() -> None:
         with warnings.catch_warnings():
