@@ -64,8 +64,8 @@ def solve_dense(
     solution = solve_secular(eigenvalues, gamma, alpha)
     s = V @ solution.coordinates
     Hs, Ms = H @ s, s if M is None else M @ s
-    norm = float(np.sqrt(s @ Ms))
-    multiplier = alpha / 2 * norm
+    # ‖s‖_M = ‖y‖, and sᵀMs would lose up to cond(M) of its digits
+    multiplier = alpha / 2 * float(np.linalg.norm(solution.coordinates))
 
     residual = float(np.linalg.norm(Hs + multiplier * Ms + g))
     # Euclidean, the norm in which the residual is computed and rounded, whatever the metric
