@@ -12,6 +12,7 @@ __all__ = ["ACRPN", "CRPN", "PAPER", "__version__"]
 __version__ = "0.1.0"
 
 PAPER = {
+    "n_reused_rollouts": 0,
     "target_kl": None,
     "metric": "euclidean",
     "hessian_estimator": "trajectory",

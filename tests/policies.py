@@ -64,6 +64,9 @@ def frozen_episodes(policy, lengths=(3, 1, 4, 2), seed=0):
         weights=rng.normal(size=n_steps),
         values=rng.normal(size=n_steps),
         returns=rng.normal(size=n_steps),
+        rewards=rng.normal(size=n_steps),
+        log_probs=rng.normal(size=n_steps),
+        terminal_values=rng.normal(size=len(lengths)),
     )
 
 

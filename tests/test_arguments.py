@@ -35,6 +35,7 @@ BAD = {
     "bootstrap_truncated": FLAG,
     "horizon": COUNT,
     "batch_size": (*COUNT, None),
+    "n_reused_rollouts": ("3", None, True, -1, 1.5, NAN),
     "n_critic_updates": ("3", None, True, -1, 1.5, NAN),
     "max_batch_timesteps": COUNT,
     "use_sde": FLAG,

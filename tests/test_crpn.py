@@ -68,7 +68,8 @@ def test_target_kl_is_met_within_ten_per_cent(algorithm, metric, actions):
     """Judged by the policies themselves. With H = 0 any divergence is within reach."""
     log, states = TrainLog(), States()
     env = Sampler(NUMBERS, actions)
-    model = make(algorithm, env, metric=metric, hessian_shrinkage=0.0, n_episodes=8)
+    settings = {"metric": metric, "hessian_shrinkage": 0.0, "n_episodes": 8}
+    model = make(algorithm, env, n_reused_rollouts=0, **settings)
     model.learn(120, [log, states])
     assert sum(log["step_rejected"]) <= 1
     steps = zip(log.rows, states.kept, log.before, log.after, strict=True)
@@ -84,7 +85,8 @@ def test_target_kl_is_met_within_ten_per_cent(algorithm, metric, actions):
 @pytest.mark.parametrize("settings", [{}, {"krylov_dim": 3}, {"hessian_estimator": "trajectory"}])
 def test_target_kl_is_never_exceeded(algorithm, metric, settings):
     log = TrainLog()
-    make(algorithm, several(), metric=metric, target_kl=0.02, **settings).learn(500, log)
+    settings = {"metric": metric, "target_kl": 0.02, "n_reused_rollouts": 0, **settings}
+    make(algorithm, several(), **settings).learn(500, log)
     met = [0.9 * 0.02 <= kl <= 0.02 for kl in log["kl_divergence"]]
     assert max(log["kl_divergence"]) <= 0.02
     assert np.mean(met) >= 0.5
@@ -144,7 +146,8 @@ def test_batch_sizes(algorithm, m, b, monkeypatch):
     """m_k and b_k episodes, each drawn without replacement from max(m_k, b_k)."""
     batches, log = Batches(monkeypatch), TrainLog()
     env = DummyVecEnv([lambda: Sampler(NUMBERS, spaces.Discrete(2))] * 2)
-    make(algorithm, env, n_steps=8, n_episodes=m, n_hessian_episodes=b).learn(100, log)
+    sizes = {"n_episodes": m, "n_hessian_episodes": b}
+    make(algorithm, env, n_steps=8, n_reused_rollouts=0, **sizes).learn(100, log)
     from_steps = 4  # 2 environments, 8 steps, episodes of 4; a single one in the first update
     simulated = log["n_episodes"]
     assert simulated[1] == max(m or 0, b or 0, 0 if m else from_steps)
@@ -176,6 +179,7 @@ def test_scheduled_batch_sizes(algorithm, rising, monkeypatch):
         Sampler(NUMBERS, spaces.Discrete(2)),
         n_episodes=n_episodes,
         n_hessian_episodes=n_hessian_episodes,
+        n_reused_rollouts=0,
     ).learn(100, log)
     gradient_sizes, hessian_sizes = zip(*batches.sizes, strict=True)
     assert list(gradient_sizes) == log["n_episodes"]
@@ -183,6 +187,21 @@ def test_scheduled_batch_sizes(algorithm, rising, monkeypatch):
     assert [abs(2 * b - m) <= 1 for m, b in batches.sizes] == [True] * len(batches.sizes)
     assert (gradient_sizes[-1] > gradient_sizes[0]) == rising
     assert min(hessian_sizes) >= 1
+
+
+@both
+def test_earlier_rollouts_of_the_same_call_join_an_update(algorithm, monkeypatch):
+    batches, log = Batches(monkeypatch), TrainLog()
+    model = make(algorithm, n_episodes=3, n_hessian_episodes=2, n_reused_rollouts=2)
+    model.learn(100, log)
+    assert set(log["n_episodes"]) == {3}
+    assert batches.sizes[:3] == [(3, 2), (3 + 3, 2 + 3), (3 + 6, 2 + 6)]
+    assert set(batches.sizes[3:]) == {(9, 8)}
+    fresh, joined = (batches.observations[k][0] for k in (0, 1))
+    assert torch.equal(joined[-len(fresh) :], fresh)  # as they were
+    batches.sizes.clear()
+    model.learn(10)
+    assert batches.sizes[0] == (3, 2)
 
 
 def replaced(algorithm, change):
@@ -258,7 +277,16 @@ def _outputs(model, observations):
         ({}, True),
         ({"baseline": False}, True),
         ({"baseline": False, "bootstrap_truncated": False}, True),
-        ({"baseline": False, "bootstrap_truncated": False, "gae_lambda": 1.0}, False),
+        ({"baseline": False, "bootstrap_truncated": False, "gae_lambda": 1.0}, True),
+        (
+            {
+                "baseline": False,
+                "bootstrap_truncated": False,
+                "gae_lambda": 1.0,
+                "n_reused_rollouts": 0,
+            },
+            False,
+        ),
         ({"n_critic_updates": 0}, False),
     ],
 )

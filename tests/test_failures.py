@@ -248,7 +248,7 @@ def test_episodes_of_a_single_step(algorithm, actions):
 def test_a_single_episode(algorithm):
     """Neither noise nor shrinkage can be measured, and the step is a first-order one."""
     log = TrainLog()
-    model = make(algorithm, n_episodes=1).learn(30, log)
+    model = make(algorithm, n_episodes=1, n_reused_rollouts=0).learn(30, log)
     assert np.isnan(log["gradient_noise"]).all()
     assert set(log["hessian_shrinkage"]) == {0.0}
     assert all_finite(model)

@@ -21,7 +21,11 @@ from sb3_crpn.base.random_state import RandomState
 from sb3_crpn.base.update import PolicyNewtonUpdate
 from sb3_crpn.curvature.scores import HessianEstimator
 from sb3_crpn.distributed import rank
-from sb3_crpn.episodes import DictEpisodeRolloutBuffer, EpisodeRolloutBuffer
+from sb3_crpn.episodes import (
+    DictEpisodeRolloutBuffer,
+    EarlierRollouts,
+    EpisodeRolloutBuffer,
+)
 from sb3_crpn.parameters import ActorParameters
 
 Self = TypeVar("Self", bound="PolicyNewtonAlgorithm")
@@ -52,6 +56,9 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
     n_hessian_episodes
         b_k, the episodes of the Hessian, likewise; ``None``: the gradient's. Where the two
         differ, max(m_k, b_k) are simulated and each set is drawn without replacement.
+    n_reused_rollouts
+        Earlier rollouts of the same call of ``learn`` that join each update, reweighted to the
+        present policy (:class:`~sb3_crpn.episodes.EarlierRollouts`); 0: none, as in the paper.
     alpha
         α of the cubic term, a float or a schedule. With ``target_kl`` only the first guess.
     target_kl
@@ -69,7 +76,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
     hessian_shrinkage
         ω in [0, 1]; "auto": the James-Stein factor from two groups of episodes; ``None``: 1.
     krylov_dim
-        Dimension of the Krylov space that steps are sought in; ``None``: 15 with ``target_kl`` or
+        Dimension of the Krylov space that steps are sought in; ``None``: 10 with ``target_kl`` or
         the Fisher metric, else as large as the solver's certificate needs.
     gamma
         Discount factor.
@@ -89,7 +96,8 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
     batch_size
         Minibatch size of the critic.
     n_critic_updates
-        Passes over the batch that fit the critic in each update, after the actor's step.
+        Passes over the batch, earlier rollouts included, that fit the critic in each update, after
+        the actor's step.
     max_batch_timesteps
         Most timesteps whose graphs are held in memory at a time, in runs of whole episodes, so
         that the longest episode is the least; ``None``: the whole batch. Batches beyond it cost
@@ -121,9 +129,10 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         policy: str | type[ActorCriticPolicy],
         env: GymEnv | str,
         learning_rate: float | Schedule = 1e-3,
-        n_steps: int = 2048,
+        n_steps: int = 1024,
         n_episodes: int | Schedule | None = None,
         n_hessian_episodes: int | Schedule | None = None,
+        n_reused_rollouts: int = 3,
         alpha: float | Schedule = 1.0,
         target_kl: float | None = 0.02,
         metric: Literal["euclidean", "fisher"] = "fisher",
@@ -140,7 +149,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         bootstrap_truncated: bool = True,
         horizon: int | None = None,
         batch_size: int = 128,
-        n_critic_updates: int = 20,
+        n_critic_updates: int = 5,
         max_batch_timesteps: int | None = None,
         use_sde: bool = False,
         sde_sample_freq: int = -1,
@@ -194,6 +203,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         )
         self.n_episodes = n_episodes
         self.n_hessian_episodes = n_hessian_episodes
+        self.n_reused_rollouts = n_reused_rollouts
         self.alpha = alpha
         self.target_kl = target_kl
         self.metric = metric
@@ -211,7 +221,6 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         self.n_critic_updates = n_critic_updates
         self.max_batch_timesteps = max_batch_timesteps
         self._fitted_alpha: float | None = None  # the last α that met target_kl
-        self._mean_episode_length = None
         if _init_setup_model:
             self._setup_model()
 
@@ -224,6 +233,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
             )
         super()._setup_model()
         self.alpha_schedule = FloatSchedule(self.alpha)
+        self.earlier_rollouts = EarlierRollouts(self.n_reused_rollouts, self.gamma, self.gae_lambda)
         self.actor = self._find_actor()
 
     def _find_actor(self) -> ActorParameters:
@@ -235,7 +245,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         return ActorParameters.reachable(self.policy, log_prob)
 
     def _excluded_save_params(self) -> list[str]:
-        own = ["actor", "alpha_schedule", "_collecting", "_statistics"]
+        own = ["actor", "alpha_schedule", "earlier_rollouts", "_collecting", "_statistics"]
         return [*super()._excluded_save_params(), *own]
 
     def learn(
@@ -248,6 +258,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         progress_bar: bool = False,
     ) -> Self:
         """Train for at least ``total_timesteps``, as SB3's algorithms do."""
+        self.earlier_rollouts.clear()  # the environment may be another one
         return super().learn(
             total_timesteps=total_timesteps,
             callback=callback,

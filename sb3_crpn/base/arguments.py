@@ -86,6 +86,7 @@ def check_arguments(model: Any) -> None:
         "n_steps": at_least_one,
         "n_episodes": partial(check_optional, check=schedule),
         "n_hessian_episodes": partial(check_optional, check=schedule),
+        "n_reused_rollouts": at_least_zero,
         "alpha": partial(check_schedule, check=positive),
         "target_kl": partial(check_optional, check=positive),
         "metric": partial(check_choice, allowed=("euclidean", "fisher")),

@@ -37,8 +37,9 @@ class EpisodeCollection(Ranks, OnPolicyAlgorithm):
 
     horizon: int | None
     baseline: bool
+    n_reused_rollouts: int
     bootstrap_truncated: bool
-    _mean_episode_length: float | None
+    _mean_episode_length: float | None = None  # of the last rollout
     _collecting: bool = False
     _batch_sizes: tuple[int | None, int | None] = (None, None)
 
@@ -49,7 +50,12 @@ class EpisodeCollection(Ranks, OnPolicyAlgorithm):
     @property
     def uses_critic(self) -> bool:
         """Whether V enters the advantages at all."""
-        return self.baseline or self.bootstrap_truncated or self.gae_lambda < 1.0
+        return (
+            self.baseline
+            or self.bootstrap_truncated
+            or self.gae_lambda < 1.0
+            or self.n_reused_rollouts > 0
+        )
 
     def collect_rollouts(
         self,

@@ -26,18 +26,25 @@ from sb3_crpn.curvature import (
 )
 from sb3_crpn.curvature.scores import HessianEstimator
 from sb3_crpn.distributed import broadcast_state, gather_counts, mean_and_variance, share
-from sb3_crpn.episodes import EpisodeBatch, EpisodeRolloutBuffer
+from sb3_crpn.episodes import (
+    EarlierRollouts,
+    EpisodeBatch,
+    EpisodeRolloutBuffer,
+    concatenate,
+)
 from sb3_crpn.parameters import ActorParameters
 
 # Dimension of the Krylov space when the step's length is set by the KL divergence: the number of
-# conjugate-gradient iterations of sb3-contrib's TRPO, whose step H = 0 then reproduces.
-KRYLOV_DIM = 15
+# conjugate-gradient iterations of Schulman et al., Trust region policy optimization, ICML 2015,
+# appendix C, whose step H = 0 then reproduces.
+KRYLOV_DIM = 10
 
 
 class PolicyNewtonUpdate(EpisodeCollection):
     """The update of DESIGN section 5; the subclass brings the arguments and the solver."""
 
     actor: ActorParameters
+    earlier_rollouts: EarlierRollouts
     n_episodes: int | Schedule | None
     n_hessian_episodes: int | Schedule | None
     alpha_schedule: Schedule
@@ -61,10 +68,13 @@ class PolicyNewtonUpdate(EpisodeCollection):
         self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
         batch = self._episode_batch(self.rollout_buffer)
-        estimate = self._estimate(batch)
+        earlier = self.earlier_rollouts.reweighted(self.policy, **self._weighting)
+        estimate = self._estimate(batch, earlier)
         model = self._local_model(estimate)
         step = self._take_step(estimate.gradient_batch, model)
-        value_loss = self._fit_critic(batch)
+        value_loss = self._fit_critic(concatenate([batch, *earlier]))
+        if step.trial.finite:  # what spoilt one step would spoil the next ones
+            self.earlier_rollouts.append(batch)
         broadcast_state(self.policy)
         self._n_updates += 1
         self._log_update(batch, estimate, model, step, value_loss)
@@ -105,18 +115,24 @@ class PolicyNewtonUpdate(EpisodeCollection):
 
     def _episode_batch(self, buffer: RolloutBuffer) -> EpisodeBatch:
         assert isinstance(buffer, EpisodeRolloutBuffer)  # by _setup_model
-        return buffer.episode_batch(
-            baseline=self.baseline,
-            normalize_advantage=self.normalize_advantage,
-            discount_visitation=self.discount_visitation,
-        )
+        return buffer.episode_batch(**self._weighting)
 
-    def _estimate(self, batch: EpisodeBatch) -> CurvatureEstimate:
-        """Estimate g from m_k and H from b_k of the episodes."""
+    @property
+    def _weighting(self) -> dict[str, bool]:
+        return {
+            "baseline": self.baseline,
+            "normalize_advantage": self.normalize_advantage,
+            "discount_visitation": self.discount_visitation,
+        }
+
+    def _estimate(self, batch: EpisodeBatch, earlier: list[EpisodeBatch]) -> CurvatureEstimate:
+        """Estimate g from m_k and H from b_k of the episodes, and from the earlier ones."""
         m, b = self._batch_sizes  # of the progress at which they were simulated
         n_simulated = sum(gather_counts(batch.n_episodes))
-        gradient_batch = self._draw(batch, m, n_simulated)
-        hessian_batch = gradient_batch if b is None else self._draw(batch, b, n_simulated)
+        gradient_batch = concatenate([self._draw(batch, m, n_simulated), *earlier])
+        hessian_batch = gradient_batch
+        if b is not None:
+            hessian_batch = concatenate([self._draw(batch, b, n_simulated), *earlier])
         return self._estimate_from(gradient_batch, hessian_batch)
 
     def _estimate_from(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TypeAlias
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -85,34 +85,6 @@ def episode_scan(
     return own
 
 
-def generalized_advantages(
-    rewards: FloatArray,
-    values: FloatArray,
-    terminal_values: FloatArray,
-    lengths: IntArray,
-    gamma: float,
-    gae_lambda: float,
-) -> FloatArray:
-    """Return GAE(λ) advantages Σ_l (γλ)^l δ_{i+l}, δ_i = r_i + γ V(s_{i+1}) - V(s_i), [T].
-
-    Parameters
-    ----------
-    rewards, values
-        r_i and V(s_i), [T].
-    terminal_values
-        V of the state after each episode's last step, [E]: 0 where the episode terminated.
-
-    References
-    ----------
-    Schulman et al., High-dimensional continuous control using generalized advantage estimation,
-    ICLR 2016, eq. 16.
-    """
-    next_values = np.append(values[1:], 0.0)
-    next_values[episode_starts(lengths) + lengths - 1] = terminal_values
-    delta = rewards + gamma * next_values - values
-    return episode_scan(delta, gamma * gae_lambda, lengths, reverse=True)
-
-
 @dataclass(frozen=True)
 class EpisodeBatch:
     """E whole episodes of T steps in all, laid end to end.
@@ -127,6 +99,12 @@ class EpisodeBatch:
         A_i of DESIGN section 2, [T]: the cost-to-go, less a baseline; positive is bad.
     values, returns
         The critic's V(s_i) and its regression target, the λ-return, [T].
+    rewards
+        r_i, [T].
+    log_probs
+        log π(a_i|s_i) of the policy that acted, [T].
+    terminal_values
+        V of the state after each episode's last step, [E]: 0 where it is not bootstrapped.
     """
 
     observations: Observations
@@ -135,6 +113,9 @@ class EpisodeBatch:
     weights: FloatArray
     values: FloatArray
     returns: FloatArray
+    rewards: FloatArray
+    log_probs: FloatArray
+    terminal_values: FloatArray
 
     @property
     def n_episodes(self) -> int:
@@ -177,7 +158,27 @@ class EpisodeBatch:
             weights=self.weights[steps],
             values=self.values[steps],
             returns=self.returns[steps],
+            rewards=self.rewards[steps],
+            log_probs=self.log_probs[steps],
+            terminal_values=self.terminal_values[episodes],
         )
+
+
+def concatenate(batches: Sequence[EpisodeBatch]) -> EpisodeBatch:
+    """Lay the episodes of all ``batches``, at least one, end to end."""
+    if len(batches) == 1:
+        return batches[0]
+    joined: dict[str, Any] = {
+        field.name: _join([getattr(batch, field.name) for batch in batches])
+        for field in fields(EpisodeBatch)
+    }
+    return EpisodeBatch(**joined)
+
+
+def _join(parts: Sequence[Any]) -> Any:
+    if isinstance(parts[0], dict):
+        return {key: _join([part[key] for part in parts]) for key in parts[0]}
+    return torch.cat(list(parts)) if isinstance(parts[0], torch.Tensor) else np.concatenate(parts)
 
 
 def map_observations(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Generator
 from typing import Any
 
@@ -14,18 +13,13 @@ from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import DictRolloutBufferSamples, RolloutBufferSamples
 
-from sb3_crpn.distributed import all_sum, mean_and_variance
-from sb3_crpn.episodes.batch import (
-    EpisodeBatch,
-    IntArray,
-    Observations,
-    episode_time,
-    generalized_advantages,
-)
+from sb3_crpn.distributed import all_sum
+from sb3_crpn.episodes.advantages import cost_weights, generalized_advantages
+from sb3_crpn.episodes.batch import EpisodeBatch, IntArray, Observations, episode_time
 from sb3_crpn.episodes.quota import EpisodeEnd
 
-# Steps in one forward pass of `evaluate`: enough to be efficient, of bounded memory
-_CHUNK = 4096
+# Steps in one forward pass that evaluates: enough to be efficient, of bounded memory
+CHUNK = 4096
 
 _ARRAYS = ("actions", "rewards", "returns", "episode_starts", "values", "log_probs", "advantages")
 
@@ -94,8 +88,8 @@ class EpisodeRolloutBuffer(RolloutBuffer):
         SB3 asks for both at every step of a rollout; asking once spares most of that time.
         """
         rows, envs = self._kept_steps()
-        for start in range(0, len(rows), _CHUNK):
-            kept = rows[start : start + _CHUNK], envs[start : start + _CHUNK]
+        for start in range(0, len(rows), CHUNK):
+            kept = rows[start : start + CHUNK], envs[start : start + CHUNK]
             with torch.no_grad():
                 values, log_probs, _ = policy.evaluate_actions(
                     self._gather_observations(kept),
@@ -122,26 +116,29 @@ class EpisodeRolloutBuffer(RolloutBuffer):
     def episode_batch(
         self, *, baseline: bool, normalize_advantage: bool, discount_visitation: bool
     ) -> EpisodeBatch:
-        """Return the kept episodes with their cost weights A_i = -γ^i Â_i.
+        """Return the kept episodes with the weights of :func:`cost_weights`.
 
-        Â is the advantage, or the λ-return where ``baseline`` is false; normalised to mean 0 and
-        standard deviation 1 over the batch of all ranks on request. Without
-        ``discount_visitation`` the factor γ^i is dropped.
+        Â is the advantage, or the λ-return where ``baseline`` is false.
         """
         kept = self._kept_steps()
-        weights = (self.advantages if baseline else self.returns)[kept].astype(np.float64)
-        if normalize_advantage:
-            mean, variance = mean_and_variance(weights)
-            weights = (weights - mean) / (math.sqrt(variance) + 1e-8)  # 1e-8: as in SB3's PPO
-        if discount_visitation:
-            weights *= self.gamma ** episode_time(self.lengths)
+        lengths = self.lengths
+        weights = cost_weights(
+            (self.advantages if baseline else self.returns)[kept].astype(np.float64),
+            lengths,
+            gamma=self.gamma,
+            normalize_advantage=normalize_advantage,
+            discount_visitation=discount_visitation,
+        )
         return EpisodeBatch(
             observations=self._gather_observations(kept),
             actions=self._gather_actions(kept),
-            lengths=self.lengths,
-            weights=-weights,
+            lengths=lengths,
+            weights=weights,
             values=self.values[kept].astype(np.float64),
             returns=self.returns[kept].astype(np.float64),
+            rewards=self.rewards[kept].astype(np.float64),
+            log_probs=self.log_probs[kept].astype(np.float64),
+            terminal_values=np.array(self._terminal_values),
         )
 
     def _gather_observations(self, kept: tuple[IntArray, IntArray]) -> Observations:

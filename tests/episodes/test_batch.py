@@ -1,3 +1,5 @@
+from dataclasses import fields
+
 import numpy as np
 import pytest
 import torch
@@ -6,10 +8,10 @@ from hypothesis import strategies as st
 
 from sb3_crpn.episodes import EpisodeBatch, episode_scan
 from sb3_crpn.episodes.batch import (
+    concatenate,
     deal,
     episode_starts,
     episode_time,
-    generalized_advantages,
     map_observations,
 )
 
@@ -47,27 +49,6 @@ def test_scan_of_a_long_batch_keeps_its_precision():
     assert np.array_equal(episode_scan(values, 1.0, lengths), expected)
 
 
-@given(LENGTHS, FACTORS, FACTORS, SEEDS)
-@settings(deadline=None)
-def test_advantages_are_the_discounted_sums_of_residuals(lengths, gamma, gae_lambda, seed):
-    lengths = np.array(lengths)
-    rng = np.random.default_rng(seed)
-    rewards, values = rng.normal(size=(2, lengths.sum()))
-    terminal_values = rng.normal(size=len(lengths))
-    expected = []
-    for e, start in enumerate(episode_starts(lengths)):
-        length = lengths[e]
-        V = np.append(values[start : start + length], terminal_values[e])
-        delta = rewards[start : start + length] + gamma * V[1:] - V[:-1]
-        for i in range(length):
-            decay = (gamma * gae_lambda) ** np.arange(length - i)
-            expected.append(decay @ delta[i:])
-    advantages = generalized_advantages(
-        rewards, values, terminal_values, lengths, gamma, gae_lambda
-    )
-    np.testing.assert_allclose(advantages, expected, rtol=1e-12, atol=1e-12)
-
-
 def test_time_and_starts_of_episodes_laid_end_to_end():
     lengths = np.array([2, 1, 3])
     assert episode_starts(lengths).tolist() == [0, 2, 3]
@@ -85,6 +66,9 @@ def numbered_batch(lengths, *, is_dict=False):
         weights=steps,
         values=steps + 0.5,
         returns=-steps,
+        rewards=2 * steps,
+        log_probs=3 * steps,
+        terminal_values=np.arange(float(len(lengths))),
     )
 
 
@@ -173,3 +157,19 @@ def test_map_observations_reaches_every_key():
     doubled = map_observations({"a": torch.ones(2)}, lambda tensor: 2.0 * tensor)
     assert doubled["a"].tolist() == [2.0, 2.0]
     assert map_observations(torch.ones(1), torch.neg).tolist() == [-1.0]
+
+
+@pytest.mark.parametrize("is_dict", [False, True])
+def test_concatenate_puts_back_together_what_take_took_apart(is_dict):
+    batch = numbered_batch([2, 1, 3, 4], is_dict=is_dict)
+    parts = [batch.take(np.array(episodes)) for episodes in ([0, 1], [2], [3])]
+    joined = concatenate(parts)
+    for field in fields(EpisodeBatch):
+        whole, again = getattr(batch, field.name), getattr(joined, field.name)
+        for one, other in zip(
+            whole.values() if isinstance(whole, dict) else [whole],
+            again.values() if isinstance(again, dict) else [again],
+            strict=True,
+        ):
+            np.testing.assert_array_equal(one, other)
+    assert concatenate([batch]) is batch

@@ -4,7 +4,7 @@ import torch
 from gymnasium import spaces
 
 from sb3_crpn.episodes import DictEpisodeRolloutBuffer, EpisodeRolloutBuffer
-from sb3_crpn.episodes.batch import generalized_advantages
+from sb3_crpn.episodes.advantages import generalized_advantages
 from sb3_crpn.episodes.quota import EpisodeEnd
 
 N_ENVS = 2

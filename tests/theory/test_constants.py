@@ -115,6 +115,9 @@ def test_estimates_of_single_episodes_are_attained():
         weights=cost_to_go.copy(),
         values=np.zeros(H),
         returns=np.zeros(H),
+        rewards=np.zeros(H),
+        log_probs=np.zeros(H),
+        terminal_values=np.zeros(1),
     )
     gradients, hessians = episode_estimates(policy, actor, batch)
     constants = Constants(K, softmax_linear(1.0), H, len(actor), gamma)

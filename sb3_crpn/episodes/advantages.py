@@ -1,0 +1,82 @@
+"""Generalised advantages, and the weights A_i that the estimators take."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.linalg import solve_banded
+
+from sb3_crpn.distributed import mean_and_variance
+from sb3_crpn.episodes.batch import (
+    FloatArray,
+    IntArray,
+    episode_scan,
+    episode_starts,
+    episode_time,
+)
+
+
+def generalized_advantages(
+    rewards: FloatArray,
+    values: FloatArray,
+    terminal_values: FloatArray,
+    lengths: IntArray,
+    gamma: float,
+    gae_lambda: float,
+    traces: FloatArray | None = None,
+) -> FloatArray:
+    """Return GAE(λ) advantages Σ_l (γλ)^l c_{i+1}⋯c_{i+l} δ_{i+l}, [T].
+
+    δ_i = r_i + γ V(s_{i+1}) - V(s_i).
+
+    Parameters
+    ----------
+    rewards, values
+        r_i and V(s_i), [T].
+    terminal_values
+        V of the state after each episode's last step, [E]: 0 where the episode terminated.
+    traces
+        c_i in [0, 1], [T]: how far to trust what another policy did at step i, as in Retrace and
+        V-trace; ``None``: 1.
+
+    References
+    ----------
+    Schulman et al., High-dimensional continuous control using generalized advantage estimation,
+    ICLR 2016, eq. 16; Espeholt et al., IMPALA, ICML 2018, eq. 1.
+    """
+    last = episode_starts(lengths) + lengths - 1
+    next_values = np.append(values[1:], 0.0)
+    next_values[last] = terminal_values
+    delta = rewards + gamma * next_values - values
+    if traces is None:
+        return episode_scan(delta, gamma * gae_lambda, lengths, reverse=True)
+    if not len(delta):
+        return delta
+    # y_i - γλ c_{i+1} y_{i+1} = δ_i within each episode: one bidiagonal system
+    bands = np.ones((2, len(delta)))
+    bands[0, 1:] = -gamma * gae_lambda * traces[1:]
+    bands[0, episode_starts(lengths)] = 0.0
+    advantages: FloatArray = solve_banded((0, 1), bands, delta, check_finite=False)
+    return advantages
+
+
+def cost_weights(
+    advantages: FloatArray,
+    lengths: IntArray,
+    *,
+    gamma: float,
+    normalize_advantage: bool,
+    discount_visitation: bool,
+) -> FloatArray:
+    """Return A_i = -γ^i Â_i, [T].
+
+    Â is normalised to mean 0 and standard deviation 1 over the batch of all ranks on request;
+    without ``discount_visitation`` the factor γ^i is dropped.
+    """
+    if normalize_advantage:
+        mean, variance = mean_and_variance(advantages)
+        advantages = (advantages - mean) / (math.sqrt(variance) + 1e-8)  # 1e-8: as in SB3's PPO
+    if discount_visitation:
+        advantages = advantages * gamma ** episode_time(lengths)
+    return -advantages
