@@ -48,6 +48,13 @@ CHECKPOINTS = {
     "CartPole-v1": (0, 5_000, 10_000, 20_000, 30_000, 50_000),
     "Pendulum-v1": (0, 10_000, 25_000, 50_000, 75_000, 100_000),
 }
+# Learning from fresh rollouts alone, so that the policies do not depend on the defaults of reuse
+SETTINGS: dict[str, int] = {
+    "n_steps": 2048,
+    "n_reused_rollouts": 0,
+    "n_critic_updates": 20,
+    "krylov_dim": 15,
+}
 N_EPISODES = {"CartPole-v1": 50, "Pendulum-v1": 100}
 N_ENVS = 8
 HESSIANS = {"own": ("-", "CRPN's"), "unbiased": (":", "unbiased")}
@@ -64,7 +71,7 @@ def jobs(seeds: int) -> list[Row]:
 def measure(env: str, seed: int) -> list[Row]:
     """Train once; return a row per checkpoint."""
     checkpoints = _Checkpoints(env, seed)
-    model = CRPN("MlpPolicy", make_vec_env(env, 1, seed=seed), seed=seed, device="cpu")
+    model = CRPN("MlpPolicy", make_vec_env(env, 1, seed=seed), seed=seed, device="cpu", **SETTINGS)
     model.learn(CHECKPOINTS[env][-1], callback=checkpoints)
     return checkpoints.rows
 
