@@ -1,7 +1,7 @@
 """Tables and figures from the CSV files alone.
 
 python -m benchmarks.learning.report                 # print the tables
-python -m benchmarks.learning.report --write docs    # benchmark.md and two pictures
+python -m benchmarks.learning.report --write docs    # BENCHMARK.md and two pictures
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def main() -> None:
         print(text)
         return
     args.write.mkdir(parents=True, exist_ok=True)
-    (args.write / "benchmark.md").write_text(text)
+    (args.write / "BENCHMARK.md").write_text(text)
     curves = args.write / "learning_curves.png"
     figures.save_learning_curves(found, args.curve_envs, args.curve_algos, curves)
     figures.save_aggregate(found, args.write / "aggregate.png")

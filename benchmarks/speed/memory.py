@@ -116,6 +116,7 @@ def _product(
         baseline=False,
         gae_lambda=1.0,
         bootstrap_truncated=False,
+        n_reused_rollouts=0,
     )
     return product_tasks(model, collect(model))[task].run, len(model.actor)
 

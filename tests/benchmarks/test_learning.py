@@ -250,7 +250,7 @@ def test_command_runs_resumes_and_reports(
     write = ["--write", str(tmp_path), "--curve-envs", task]
     monkeypatch.setattr(sys, "argv", ["report", *options, *write])
     report.main()
-    assert f"| {task} | CRPN | 1 |" in (tmp_path / "benchmark.md").read_text()
+    assert f"| {task} | CRPN | 1 |" in (tmp_path / "BENCHMARK.md").read_text()
     for name in ("learning_curves.png", "aggregate.png"):
         assert (tmp_path / name).stat().st_size > 10_000
 
