@@ -21,7 +21,7 @@ def main() -> None:
     torch.set_num_threads(1)  # on so small a network threads cost more than they bring
     run = Path("runs") / f"CartPole-v1_{datetime.now():%Y%m%d-%H%M%S}"
     env = make_vec_env("CartPole-v1", n_envs=4, seed=0, monitor_dir=str(run / "monitor"))
-    model = CRPN("MlpPolicy", env, n_steps=512, seed=0, device="cpu")
+    model = CRPN("MlpPolicy", env, n_steps=512, target_kl=0.01, seed=0, device="cpu")
     model.learn(TIMESTEPS, progress_bar=True)
     model.save(run / "model")
 
