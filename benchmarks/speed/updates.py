@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import inspect
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -19,21 +18,23 @@ from benchmarks.speed.problems import noise
 from benchmarks.speed.timing import Row, Task, compare
 from sb3_crpn import ACRPN, CRPN
 from sb3_crpn.base import PolicyNewtonAlgorithm
+from sb3_crpn.episodes import EarlierRollouts
 
 # Rollouts trained on before the one that is timed: α, Adam and any earlier rollouts are then as
 # they are in the middle of training
 WARM_UP_ROLLOUTS = 3
 
-# What training changes besides networks and optimiser: numbers, and what is kept of the past
-_MUTABLE = (bool, int, float, type(None))
-_PAST = ("earlier_rollouts",)
+SETTINGS: dict[str, dict[str, Any]] = {"one rollout": {"n_reused_rollouts": 0}, "defaults": {}}
+
+# What training changes besides networks and optimiser
+_MUTABLE = (bool, int, float, type(None), EarlierRollouts)
 
 
 def measure(repeats: int = 20, n_steps: int = 2048, n_envs: int = 2) -> list[Row]:
     """Compare whole updates, and updates without the critic's fit.
 
     CartPole-v1 is the task itself in one environment, HalfCheetah-v5 noise of its shapes. "one
-    rollout": without the earlier rollouts that the constructor's defaults may add.
+    rollout": without the earlier rollouts that join an update by default.
     """
     problems: dict[str, tuple[Callable[[], VecEnv], dict[str, Any]]] = {
         "CartPole-v1": (lambda: make_vec_env("CartPole-v1", seed=0), {"n_steps": n_steps}),
@@ -44,7 +45,7 @@ def measure(repeats: int = 20, n_steps: int = 2048, n_envs: int = 2) -> list[Row
     }
     rows = []
     for name, (env, arguments) in problems.items():
-        for setting, extra in settings().items():
+        for setting, extra in SETTINGS.items():
             models = prepare(env, arguments | extra)
             steps = int(models["CRPN"].rollout_buffer.pos * models["CRPN"].n_envs)
             for part in ("update", "actor only"):
@@ -55,14 +56,6 @@ def measure(repeats: int = 20, n_steps: int = 2048, n_envs: int = 2) -> list[Row
                 }
                 rows.append(compare(case, tasks, "TRPO", repeats))
     return rows
-
-
-def settings() -> dict[str, dict[str, Any]]:
-    """Return the settings to compare: with and without earlier rollouts, where there are any."""
-    parameter = inspect.signature(CRPN.__init__).parameters.get("n_reused_rollouts")
-    if parameter is None or not parameter.default:
-        return {"one rollout": {}}
-    return {"one rollout": {"n_reused_rollouts": 0}, "defaults": {}}
 
 
 def prepare(
@@ -81,7 +74,7 @@ def prepare(
         trpo = TRPO("MlpPolicy", env(), n_steps=leader.n_steps, **critic, **common)
     followers = [ACRPN("MlpPolicy", env(), **common, **arguments), trpo]
     callbacks = {model: model._setup_learn(1)[1] for model in (leader, *followers)}
-    warm_ups = max(WARM_UP_ROLLOUTS, getattr(leader, "n_reused_rollouts", 0))
+    warm_ups = max(WARM_UP_ROLLOUTS, leader.n_reused_rollouts)
     for number in range(warm_ups + 1):
         for _ in range(2 if number == 0 else 1):  # the first tells how long the episodes are
             leader.collect_rollouts(
@@ -130,7 +123,7 @@ def update_task(model: OnPolicyAlgorithm, *, critic: bool) -> Task:
     """Return ``model.train()`` from the state in which the model is now."""
     policy = copy.deepcopy(model.policy.state_dict())
     optimizer = copy.deepcopy(model.policy.optimizer.state_dict())
-    state = {k: v for k, v in vars(model).items() if isinstance(v, _MUTABLE) or k in _PAST}
+    state = {name: value for name, value in vars(model).items() if isinstance(value, _MUTABLE)}
     state = copy.deepcopy(state)
     if not critic:
         state["n_critic_updates"] = 0

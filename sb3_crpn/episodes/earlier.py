@@ -51,28 +51,19 @@ class EarlierRollouts:
         """Forget all."""
         self._batches.clear()
 
-    def reweighted(
-        self,
-        policy: ActorCriticPolicy,
-        *,
-        baseline: bool,
-        normalize_advantage: bool,
-        discount_visitation: bool,
-    ) -> list[EpisodeBatch]:
+    def reweighted(self, policy: ActorCriticPolicy, **weighting: bool) -> list[EpisodeBatch]:
         """Return the rollouts, the oldest first, as the present policy sees them.
 
-        Options are those of :meth:`EpisodeRolloutBuffer.episode_batch`; each rollout is normalised
-        by itself, as it was when it was fresh.
+        ``weighting`` is that of :meth:`EpisodeRolloutBuffer.episode_batch`; each rollout is
+        normalised by itself, as it was when it was fresh.
         """
-        return [
-            self._reweight(policy, batch, baseline, normalize_advantage, discount_visitation)
-            for batch in self._batches
-        ]
+        return [self._reweight(policy, batch, **weighting) for batch in self._batches]
 
     def _reweight(
         self,
         policy: ActorCriticPolicy,
         batch: EpisodeBatch,
+        *,
         baseline: bool,
         normalize_advantage: bool,
         discount_visitation: bool,

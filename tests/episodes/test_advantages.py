@@ -11,13 +11,17 @@ FACTORS = st.sampled_from([0.0, 0.5, 0.99, 1.0])
 SEEDS = st.integers(0, 10_000)
 
 
+def random_episodes(lengths, seed):
+    """Lengths, rewards, values, terminal values and traces."""
+    lengths, rng = np.array(lengths), np.random.default_rng(seed)
+    rewards, values = rng.normal(size=(2, lengths.sum()))
+    return lengths, rewards, values, rng.normal(size=len(lengths)), rng.uniform(size=lengths.sum())
+
+
 @given(LENGTHS, FACTORS, FACTORS, SEEDS)
 @settings(deadline=None)
 def test_advantages_are_the_discounted_sums_of_residuals(lengths, gamma, gae_lambda, seed):
-    lengths = np.array(lengths)
-    rng = np.random.default_rng(seed)
-    rewards, values = rng.normal(size=(2, lengths.sum()))
-    terminal_values = rng.normal(size=len(lengths))
+    lengths, rewards, values, terminal_values, _ = random_episodes(lengths, seed)
     expected = []
     for e, start in enumerate(episode_starts(lengths)):
         length = lengths[e]
@@ -35,11 +39,7 @@ def test_advantages_are_the_discounted_sums_of_residuals(lengths, gamma, gae_lam
 @given(LENGTHS, FACTORS, FACTORS, SEEDS)
 @settings(deadline=None)
 def test_traces_discount_what_lies_behind_a_step(lengths, gamma, gae_lambda, seed):
-    lengths = np.array(lengths)
-    rng = np.random.default_rng(seed)
-    rewards, values = rng.normal(size=(2, lengths.sum()))
-    terminal_values = rng.normal(size=len(lengths))
-    traces = rng.uniform(size=lengths.sum())
+    lengths, rewards, values, terminal_values, traces = random_episodes(lengths, seed)
     expected = np.empty(lengths.sum())
     for e, start in enumerate(episode_starts(lengths)):
         V, following = terminal_values[e], 0.0
