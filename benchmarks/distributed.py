@@ -172,29 +172,41 @@ def model_lines(
 ) -> Iterator[str]:
     """Yield what more ranks would do, each with the timesteps that one process had.
 
-    A reduction by a ring of W ranks takes 2(W - 1) hops, each with 1/W of the bytes. Work and
-    messages are taken at their fastest, when other processes disturbed them least.
+    A reduction by a ring of W ranks takes 2(W - 1) hops, each with 1/W of the bytes. What the
+    measured ranks' update took beyond that and its share of the work is laid on the messages, each
+    the same, whatever W: packing them, waking up, and minibatches too small to be efficient. Work
+    and messages are taken at their fastest, when other processes disturbed them least.
     """
     fastest = {int(size): min(seconds) for size, seconds in results["reductions"].items()}
     small, large = min(fastest), max(fastest)
     hops = 2 * (results["ranks"] - 1)
     per_hop = fastest[small] / hops
     per_byte = (fastest[large] - fastest[small]) / (large - small) * results["ranks"] / hops
-    seconds = {
-        part: min(t[0] for t in results["times"][part][MODES[0]]) for part in results["times"]
-    }
-    work = seconds["collection"] + seconds["update"]
+
+    def reducing(number: float, total_bytes: float, n_ranks: int) -> float:
+        hops = 2 * (n_ranks - 1)
+        return number * hops * per_hop + total_bytes * hops / n_ranks * per_byte
+
+    one, many = (
+        {part: min(t[0] for t in times[mode]) for part, times in results["times"].items()}
+        for mode in MODES
+    )
+    number, total = n_others + n_critic, others + n_critic * critic
+    explained = one["update"] / results["ranks"] + reducing(number, total, results["ranks"])
+    per_message = max(0.0, many["update"] - explained) / number
+    work = one["collection"] + one["update"]
     yield (
-        f"\n{1e6 * per_hop:.0f} µs a hop, {1e-9 / per_byte:.1f} GB/s, {work:.2f} s of work an "
-        "update\n\n| ranks | `batch_size` | messages, s | efficiency | timesteps/s | episodes/s |"
+        f"\n{1e6 * per_message:.0f} µs a message and {1e6 * per_hop:.0f} µs a hop, "
+        f"{1e-9 / per_byte:.1f} GB/s, {work:.2f} s of work an update\n\n"
+        "| ranks | `batch_size` | messages, s | efficiency | timesteps/s | episodes/s |"
         "\n|---|---|---|---|---|---|"
     )
     for own in (results["batch size"], results["timesteps"]):  # a rank's part of a minibatch
         minibatches = n_critic * results["batch size"] / own
         for n_ranks in RANKS:
-            hops = 2 * (n_ranks - 1)
-            waiting = (n_others + minibatches) * hops * per_hop
-            waiting += (others + minibatches * critic) * hops / n_ranks * per_byte
+            number = n_others + minibatches
+            waiting = number * per_message
+            waiting += reducing(number, others + minibatches * critic, n_ranks)
             rate = n_ranks / (work + waiting)
             yield (
                 f"| {n_ranks} | {n_ranks} · {own} | {waiting:.2f} "

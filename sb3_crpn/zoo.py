@@ -109,7 +109,7 @@ def _sample(trial: Trial) -> dict[str, Any]:
         "one_minus_gae_lambda": trial.suggest_float("one_minus_gae_lambda", 0.0001, 0.1, log=True),
         "learning_rate": trial.suggest_float("learning_rate", 1e-4, 1e-2, log=True),
         "n_reused_rollouts": trial.suggest_int("n_reused_rollouts", 0, 7),
-        "n_critic_updates": trial.suggest_int("n_critic_updates", 2, 20),
+        "n_critic_updates": trial.suggest_int("n_critic_updates", 5, 30),
         "target_kl": trial.suggest_float("target_kl", 0.001, 0.3, log=True),
         "fisher_damping": trial.suggest_float("fisher_damping", 1e-3, 1.0, log=True),
         "hessian_lambda": trial.suggest_float("hessian_lambda", 0.0, 1.0),

@@ -130,13 +130,14 @@ class Batches:
     """Records the batches that curvature is estimated from."""
 
     def __init__(self, monkeypatch):
-        self.sizes, self.observations = [], []
+        self.sizes, self.observations, self.of_fisher = [], [], []
         self.estimate = update.estimate_curvature
         monkeypatch.setattr(update, "estimate_curvature", self)
 
     def __call__(self, policy, actor, gradient_batch, hessian_batch, *rest):
         self.sizes.append((gradient_batch.n_episodes, hessian_batch.n_episodes))
         self.observations.append((gradient_batch.observations, hessian_batch.observations))
+        self.of_fisher.append(rest[-1].n_episodes)
         return self.estimate(policy, actor, gradient_batch, hessian_batch, *rest)
 
 
@@ -195,8 +196,11 @@ def test_earlier_rollouts_of_the_same_call_join_an_update(algorithm, monkeypatch
     model = make(algorithm, n_episodes=3, n_hessian_episodes=2, n_reused_rollouts=2)
     model.learn(100, log)
     assert set(log["n_episodes"]) == {3}
+    assert log["n_reused_rollouts"][:3] == [0, 1, 2]
+    assert set(log["n_reused_rollouts"][3:]) == {2}
     assert batches.sizes[:3] == [(3, 2), (3 + 3, 2 + 3), (3 + 6, 2 + 6)]
     assert set(batches.sizes[3:]) == {(9, 8)}
+    assert set(batches.of_fisher) == {3}
     fresh, joined = (batches.observations[k][0] for k in (0, 1))
     assert torch.equal(joined[-len(fresh) :], fresh)  # as they were
     batches.sizes.clear()
@@ -232,7 +236,7 @@ def test_bad_steps_are_rejected_bitwise(algorithm, metric, change, target_kl, mo
     model, log = make(algorithm, metric=metric, target_kl=target_kl), TrainLog()
     earlier = tensors(model)
     monkeypatch.setattr(algorithm, "_solve", replaced(algorithm, change))
-    monkeypatch.setattr(model, "_fit_critic", lambda batch: None)
+    monkeypatch.setattr(model, "_fit_critic", lambda batch, earlier: None)
     model.learn(20, log)
     assert log["step_rejected"] == [1] * len(log.rows)
     assert log["step_norm"] == log["kl_divergence"] == [0.0] * len(log.rows)

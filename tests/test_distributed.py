@@ -105,9 +105,9 @@ def measured(n_of_rank_0, max_steps=None):
         results[f"{name} shrinkage"] = torch.tensor(model.shrinkage)
     tester.restore()
     results["product"] = full_model(other, 0.5).product(v)
-    # one minibatch an epoch, for which nothing is drawn
+    # one minibatch a pass, for which nothing is drawn
     loss = fit_critic(
-        policy, actor, batch, n_epochs=3, batch_size=100, rng=np.random.default_rng(rank())
+        policy, actor, batch, n_minibatches=3, batch_size=100, rng=np.random.default_rng(rank())
     )
     results["critic"] = torch.nn.utils.parameters_to_vector(policy.parameters()).detach()
     results["critic loss"] = torch.tensor(loss)

@@ -57,7 +57,7 @@ def measured(kind, device):
             effect = torch.tensor([trial.kl, trial.surrogate_change])
             results |= {f"step {number} {max_steps}": step, f"trial {number} {max_steps}": effect}
         tester.restore()
-    options = {"n_epochs": 2, "batch_size": 4, "rng": np.random.default_rng(0)}
+    options = {"n_minibatches": 8, "batch_size": 4, "rng": np.random.default_rng(0)}
     results["loss"] = torch.tensor(fit_critic(policy, actor, batch, **options))
     results["policy"] = torch.nn.utils.parameters_to_vector(policy.parameters()).detach()
     return {name: tensor.cpu() for name, tensor in results.items()}

@@ -57,8 +57,9 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         b_k, the episodes of the Hessian, likewise; ``None``: the gradient's. Where the two
         differ, max(m_k, b_k) are simulated and each set is drawn without replacement.
     n_reused_rollouts
-        Earlier rollouts of the same call of ``learn`` that join each update, reweighted to the
-        present policy (:class:`~sb3_crpn.episodes.EarlierRollouts`); 0: none, as in the paper.
+        Most earlier rollouts of the same call of ``learn`` that join each update, reweighted to
+        the present policy (:class:`~sb3_crpn.episodes.EarlierRollouts`), which ends for a rollout
+        that has become too unlike it; 0: none, as in the paper.
     alpha
         α of the cubic term, a float or a schedule. With ``target_kl`` only the first guess.
     target_kl
@@ -96,8 +97,8 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
     batch_size
         Minibatch size of the critic.
     n_critic_updates
-        Passes over the batch, earlier rollouts included, that fit the critic in each update, after
-        the actor's step.
+        Passes over the rollout that fit the critic in each update, after the actor's step; earlier
+        rollouts that join share in these minibatches.
     max_batch_timesteps
         Most timesteps whose graphs are held in memory at a time, in runs of whole episodes, so
         that the longest episode is the least; ``None``: the whole batch. Batches beyond it cost
@@ -149,7 +150,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         bootstrap_truncated: bool = True,
         horizon: int | None = None,
         batch_size: int = 128,
-        n_critic_updates: int = 5,
+        n_critic_updates: int = 20,
         max_batch_timesteps: int | None = None,
         use_sde: bool = False,
         sde_sample_freq: int = -1,

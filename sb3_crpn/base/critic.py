@@ -23,7 +23,7 @@ def fit_critic(
     actor: ActorParameters,
     batch: EpisodeBatch,
     *,
-    n_epochs: int,
+    n_minibatches: int,
     batch_size: int,
     rng: np.random.Generator,
 ) -> float:
@@ -40,23 +40,23 @@ def fit_critic(
         Parameters that stay as they are, also where the critic shares them.
     batch
         This rank's episodes, possibly none. Gradients, losses and units are those of all ranks'.
-    n_epochs, batch_size
-        Passes over the steps of all ranks' batches, in random minibatches of this size, to which
-        each rank contributes in proportion to its steps.
+    n_minibatches, batch_size
+        How many minibatches of this size, in random passes over the steps of all ranks' batches;
+        each rank contributes to them in proportion to its steps.
     rng
         Of the minibatches.
 
     Returns
     -------
     float
-        The mean loss over all minibatches, in the rewards' units (nan for no epochs). Returns or a
+        The mean loss over all minibatches, in the rewards' units (nan for none). Returns or a
         loss that are not finite end the fit with the parameters as they are: infinity.
     """
     largest = float(np.abs(batch.returns).max(initial=0.0))
     largest = all_max(largest if np.isfinite(largest) else float("inf"))
     if np.isinf(largest):
         return float("inf")
-    if not n_epochs:
+    if not n_minibatches:
         return float("nan")
     # not in training mode: a normalisation layer's statistics may be the actor's too
     policy.set_training_mode(False)
@@ -67,7 +67,7 @@ def fit_critic(
     )
     losses = []
     with _in_units(layer, shift, scale):
-        for chosen in _minibatches(batch.n_steps, n_epochs, batch_size, rng, policy.device):
+        for chosen in _minibatches(batch.n_steps, n_minibatches, batch_size, rng, policy.device):
             policy.optimizer.zero_grad()
             loss = _backward(policy, _at(batch.observations, chosen), returns[chosen])
             for parameter in actor.tensors:
@@ -80,16 +80,17 @@ def fit_critic(
 
 
 def _minibatches(
-    n_steps: int, n_epochs: int, batch_size: int, rng: np.random.Generator, device: torch.device
+    n_steps: int, number: int, batch_size: int, rng: np.random.Generator, device: torch.device
 ) -> Iterator[torch.Tensor]:
     """Yield this rank's steps of each minibatch: equally many minibatches on every rank."""
     total = sum(gather_counts(n_steps))
-    count = math.ceil(total / batch_size)
+    per_pass = math.ceil(total / batch_size)
     size = max(1, math.ceil(batch_size * n_steps / total))
-    for _ in range(n_epochs):
-        order = torch.as_tensor(rng.permutation(n_steps), device=device)
-        for start in range(0, count * size, size):
-            yield order[start : start + size]
+    for index in range(number):
+        start = index % per_pass * size
+        if start == 0:
+            order = torch.as_tensor(rng.permutation(n_steps), device=device)
+        yield order[start : start + size]
 
 
 def _backward(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import numpy as np
@@ -72,12 +73,12 @@ class PolicyNewtonUpdate(EpisodeCollection):
         estimate = self._estimate(batch, earlier)
         model = self._local_model(estimate)
         step = self._take_step(estimate.gradient_batch, model)
-        value_loss = self._fit_critic(concatenate([batch, *earlier]))
+        value_loss = self._fit_critic(batch, earlier)
         if step.trial.finite:  # what spoilt one step would spoil the next ones
             self.earlier_rollouts.append(batch)
         broadcast_state(self.policy)
         self._n_updates += 1
-        self._log_update(batch, estimate, model, step, value_loss)
+        self._log_update(batch, len(earlier), estimate, model, step, value_loss)
 
     def estimate_curvature(self, n_episodes: int, env: VecEnv | None = None) -> CurvatureEstimate:
         """Estimate gradient and Hessian of J at the current policy from fresh episodes.
@@ -126,17 +127,24 @@ class PolicyNewtonUpdate(EpisodeCollection):
         }
 
     def _estimate(self, batch: EpisodeBatch, earlier: list[EpisodeBatch]) -> CurvatureEstimate:
-        """Estimate g from m_k and H from b_k of the episodes, and from the earlier ones."""
+        """Estimate g from m_k and H from b_k of the episodes, and from the earlier ones.
+
+        F, of which no return makes noise, is the m_k episodes' alone.
+        """
         m, b = self._batch_sizes  # of the progress at which they were simulated
         n_simulated = sum(gather_counts(batch.n_episodes))
-        gradient_batch = concatenate([self._draw(batch, m, n_simulated), *earlier])
+        drawn = self._draw(batch, m, n_simulated)
+        gradient_batch = concatenate([drawn, *earlier])
         hessian_batch = gradient_batch
         if b is not None:
             hessian_batch = concatenate([self._draw(batch, b, n_simulated), *earlier])
-        return self._estimate_from(gradient_batch, hessian_batch)
+        return self._estimate_from(gradient_batch, hessian_batch, drawn)
 
     def _estimate_from(
-        self, gradient_batch: EpisodeBatch, hessian_batch: EpisodeBatch
+        self,
+        gradient_batch: EpisodeBatch,
+        hessian_batch: EpisodeBatch,
+        fisher_batch: EpisodeBatch | None = None,
     ) -> CurvatureEstimate:
         return estimate_curvature(
             self.policy,
@@ -145,6 +153,7 @@ class PolicyNewtonUpdate(EpisodeCollection):
             hessian_batch,
             PairWeights(self.hessian_estimator, self.hessian_lambda),
             self.max_batch_timesteps,
+            fisher_batch,
         )
 
     def _draw(self, batch: EpisodeBatch, n_episodes: int | None, n_simulated: int) -> EpisodeBatch:
@@ -192,15 +201,19 @@ class PolicyNewtonUpdate(EpisodeCollection):
             self._fitted_alpha = step.alpha
         return step
 
-    def _fit_critic(self, batch: EpisodeBatch) -> float | None:
-        """Regress V on the λ-returns; ``None`` where V is not used."""
+    def _fit_critic(self, batch: EpisodeBatch, earlier: list[EpisodeBatch]) -> float | None:
+        """Regress V on the λ-returns; ``None`` where V is not used.
+
+        The earlier rollouts share in the minibatches of the fresh one, which become no more.
+        """
         if not self.uses_critic:
             return None
+        per_pass = math.ceil(sum(gather_counts(batch.n_steps)) / self.batch_size)
         return fit_critic(
             self.policy,
             self.actor,
-            batch,
-            n_epochs=self.n_critic_updates,
+            concatenate([batch, *earlier]),
+            n_minibatches=self.n_critic_updates * per_pass,
             batch_size=self.batch_size,
             rng=self._rng,
         )
@@ -208,6 +221,7 @@ class PolicyNewtonUpdate(EpisodeCollection):
     def _log_update(
         self,
         batch: EpisodeBatch,
+        n_earlier: int,
         estimate: CurvatureEstimate,
         model: LocalModel,
         step: PolicyStep,
@@ -222,6 +236,7 @@ class PolicyNewtonUpdate(EpisodeCollection):
             "hessian_vector_products": model.products or step.cubic.products,
             "hessian_shrinkage": model.shrinkage,
             "n_episodes": sum(gather_counts(batch.n_episodes)),
+            "n_reused_rollouts": n_earlier,
             "used_timesteps_fraction": self.rollout_buffer.used_fraction,
             "explained_variance": _explained_variance(batch),
         }

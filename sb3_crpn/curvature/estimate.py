@@ -180,8 +180,7 @@ class CurvatureEstimate:
     hessian
         H ≈ ∇²J(θ).
     fisher
-        F, the policy's Fisher matrix, a mean over the steps of the gradient's episodes and over
-        the action's components.
+        F, the policy's Fisher matrix, a mean over steps and over the action's components.
     gradient_noise
         Estimate of E‖g - ∇J‖² / ‖g‖², from the disagreement of groups; nan for one episode.
     gradient_batch
@@ -202,6 +201,7 @@ def estimate_curvature(
     hessian_batch: EpisodeBatch,
     pair_weights: PairWeights,
     max_steps: int | None = None,
+    fisher_batch: EpisodeBatch | None = None,
 ) -> CurvatureEstimate:
     """Estimate g, H and F as in DESIGN section 2.
 
@@ -210,20 +210,28 @@ def estimate_curvature(
     policy, actor
         The policy at θ, in evaluation mode, and its actor's parameters.
     gradient_batch, hessian_batch
-        This rank's of the m episodes of g and F and of the b of H. When they are the same object,
-        on every rank or on none, the graphs are shared.
+        This rank's of the m episodes of g and of the b of H.
     pair_weights
         W of the Hessian estimator.
     max_steps
         Most steps whose graphs are held at a time, but at least one episode; ``None``: all.
+    fisher_batch
+        This rank's episodes of F; ``None``: the gradient's. Batches that are the same object, on
+        every rank or on none, share their graphs.
     """
-    batches = [gradient_batch]
-    if hessian_batch is not gradient_batch:
-        batches.append(hessian_batch)
-    if max_steps is not None and sum(batch.n_steps for batch in batches) <= max_steps:
+    wanted = [
+        gradient_batch,
+        hessian_batch,
+        gradient_batch if fisher_batch is None else fisher_batch,
+    ]
+    batches = {id(batch): batch for batch in wanted}
+    if max_steps is not None and sum(batch.n_steps for batch in batches.values()) <= max_steps:
         max_steps = None
-    groups = [NoiseGroups(policy, actor, batch, pair_weights, max_steps) for batch in batches]
-    of_gradient, of_hessian = groups[0], groups[-1]
+    groups = {
+        key: NoiseGroups(policy, actor, batch, pair_weights, max_steps)
+        for key, batch in batches.items()
+    }
+    of_gradient, of_hessian, of_fisher = (groups[id(batch)] for batch in wanted)
     gradients = all_sum(of_gradient.means(EpisodeGroup.gradient, "n_episodes"))
     shares = (of_gradient.n_episodes / of_gradient.n_episodes.sum()).to(gradients.device)
     return CurvatureEstimate(
@@ -238,8 +246,8 @@ def estimate_curvature(
         ),
         fisher=EpisodeOperator(
             len(actor),
-            lambda v: of_gradient.means(lambda group: group.fisher_product(v), "n_steps"),
-            of_gradient.n_steps,
+            lambda v: of_fisher.means(lambda group: group.fisher_product(v), "n_steps"),
+            of_fisher.n_steps,
         ),
         gradient_noise=relative_noise(gradients, shares),
         gradient_batch=gradient_batch,

@@ -10,6 +10,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_crpn import CRPN
+from sb3_crpn.base import update
 from sb3_crpn.base.critic import fit_critic
 from sb3_crpn.parameters import ActorParameters
 from tests.policies import ACTION_SPACES, OBSERVATION_SPACE, frozen_episodes
@@ -45,7 +46,8 @@ def shared():
 
 def fit(policy, actor, batch, n_epochs=30, seed=0):
     rng = np.random.default_rng(seed)
-    return fit_critic(policy, actor, batch, n_epochs=n_epochs, batch_size=32, rng=rng)
+    n_minibatches = n_epochs * -(-batch.n_steps // 32)
+    return fit_critic(policy, actor, batch, n_minibatches=n_minibatches, batch_size=32, rng=rng)
 
 
 def squared_error(policy, batch):
@@ -149,3 +151,15 @@ def test_the_update_fits_the_critic_around_a_shared_extractor(monkeypatch):
     assert torch.equal(model.actor.vector, states[0])
     assert not torch.equal(model.actor.vector, start)
     assert not torch.equal(model.policy.value_net.weight, value)
+
+
+def test_earlier_rollouts_share_in_the_minibatches_of_the_fresh_one(monkeypatch):
+    passes = []
+    monkeypatch.setattr(
+        update, "fit_critic", lambda *a, **options: passes.append((a[2].n_steps, options)) or 0.0
+    )
+    CRPN("MlpPolicy", Noise(), n_episodes=20, n_critic_updates=3, seed=0, device="cpu").learn(300)
+    sizes = [n_steps for n_steps, _ in passes]
+    assert sizes == sorted(sizes)
+    assert sizes[-1] > sizes[0]
+    assert {options["n_minibatches"] for _, options in passes} == {3}

@@ -114,6 +114,19 @@ def test_graphs_are_shared_and_kept(frozen, monkeypatch):
     assert len(calls) == n_groups
 
 
+def test_fisher_matrix_of_episodes_of_its_own():
+    policy, actor = small_policy("gaussian")
+    batch = frozen_episodes(policy, lengths=(3, 1, 4, 2, 5))
+    few = batch.take(np.array([3, 0, 4]))
+    weights = PairWeights("causal")
+    estimate = estimate_curvature(policy, actor, batch, batch, weights, fisher_batch=few)
+    of_few = estimate_curvature(policy, actor, few, few, weights)
+    of_all = estimate_curvature(policy, actor, batch, batch, weights)
+    torch.testing.assert_close(estimate.fisher.to_dense(), of_few.fisher.to_dense())
+    torch.testing.assert_close(estimate.hessian.to_dense(), of_all.hessian.to_dense())
+    torch.testing.assert_close(estimate.gradient, of_all.gradient)
+
+
 @pytest.mark.parametrize("kind", ["discrete", "gaussian"])
 @pytest.mark.parametrize("max_steps", [1, 4, 8, 14])
 def test_batches_that_do_not_fit_are_accumulated(kind, max_steps, monkeypatch):

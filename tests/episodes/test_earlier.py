@@ -7,9 +7,10 @@ import torch
 from sb3_crpn.curvature import PairWeights
 from sb3_crpn.curvature.scores import EpisodeGroup
 from sb3_crpn.episodes import EarlierRollouts
+from sb3_crpn.episodes import earlier as module
 from sb3_crpn.episodes.advantages import cost_weights, generalized_advantages
 from sb3_crpn.episodes.buffer import CHUNK
-from sb3_crpn.episodes.earlier import MAX_RATIO
+from sb3_crpn.episodes.earlier import MAX_RATIO, MIN_EFFECTIVE_SIZE
 from tests.policies import frozen_episodes, small_policy
 
 GAMMA, GAE_LAMBDA = 0.9, 0.8
@@ -70,13 +71,13 @@ def test_rollout_of_the_present_policy_has_the_weights_of_a_fresh_one(
     np.testing.assert_array_equal(again.values, values)
 
 
-@pytest.mark.parametrize("kind", ["discrete", "gaussian"])
-def test_weights_follow_the_formula_after_the_policy_has_moved(kind):
+@pytest.mark.parametrize(("kind", "scale"), [("discrete", 0.5), ("gaussian", 0.2)])
+def test_weights_follow_the_formula_after_the_policy_has_moved(kind, scale):
     policy, _ = small_policy(kind)
     batch = rollout(policy, lengths=(3, 1, 4, 2, 30))
     with torch.random.fork_rng():
         torch.manual_seed(1)
-        perturb(policy, 0.5)
+        perturb(policy, scale)
     values, log_probs = evaluated(policy, batch)
     ratios = np.exp(log_probs - batch.log_probs)
     assert ratios.min() < 1.0 < MAX_RATIO < ratios.max()
@@ -142,6 +143,24 @@ def test_the_oldest_is_forgotten_first():
     assert kept(*batches, size=0).reweighted(policy, **RAW) == []
 
 
+@pytest.mark.parametrize("change", [0.1, 0.4, -100.0, 100.0])
+def test_a_rollout_is_forgotten_for_good_once_its_effective_size_is_less_than_half(change):
+    policy, _ = small_policy("gaussian")
+    batch = rollout(policy, lengths=(50,) * 40)
+    earlier = kept(batch)
+    with torch.no_grad():
+        policy.log_std += change
+    with np.errstate(over="ignore", invalid="ignore"):
+        ratios = np.exp(evaluated(policy, batch)[1] - batch.log_probs)
+        effective = ratios.sum() ** 2 / (ratios**2).sum() / batch.n_steps  # nan for 0 / 0
+    alike = bool(effective > MIN_EFFECTIVE_SIZE)
+    assert alike == (change == 0.1)
+    assert bool(earlier.reweighted(policy, **RAW)) == alike
+    with torch.no_grad():
+        policy.log_std -= change
+    assert bool(earlier.reweighted(policy, **RAW)) == alike
+
+
 def test_long_rollouts_are_evaluated_in_pieces():
     policy, _ = small_policy("discrete")
     batch = rollout(policy, lengths=(CHUNK, 100, 50))
@@ -149,7 +168,9 @@ def test_long_rollouts_are_evaluated_in_pieces():
     np.testing.assert_allclose(again.values, evaluated(policy, batch)[0], rtol=1e-5, atol=1e-6)
 
 
-def test_no_episodes_on_this_rank():
+def test_no_episodes_on_this_rank(monkeypatch):
+    of_another = torch.tensor([10.0, 10.0, 10.0], dtype=torch.float64)
+    monkeypatch.setattr(module, "all_sum", lambda tensor: tensor + of_another)
     policy, _ = small_policy("discrete")
     batch = rollout(policy).take(np.zeros(0, dtype=int))
     (again,) = kept(batch).reweighted(policy, **RAW)
