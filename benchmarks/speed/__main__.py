@@ -28,6 +28,7 @@ from benchmarks.speed import (
     products,
     scaling,
     solves,
+    stepping,
     training,
     updates,
 )
@@ -38,6 +39,7 @@ PARTS: dict[str, Callable[..., list[Row]]] = {
     "products": products.measure,
     "updates": updates.measure,
     "collection": collection.measure,
+    "stepping": stepping.measure,
     "training": training.measure,
     "solves": solves.measure,
     "scaling": scaling.measure,

@@ -14,6 +14,7 @@ TITLES = {
     "products": "Products, in gradients",
     "updates": "Updates, in TRPO's",
     "collection": "Collection, per simulated step, in SB3's",
+    "stepping": "Simulation, per step of an environment, in DummyVecEnv's",
     "training": "Training, per timestep, in TRPO's",
     "solves": "Solves of random cubic models",
     "scaling": "Cost against T and d",
