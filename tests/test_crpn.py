@@ -17,6 +17,7 @@ from sb3_crpn.base import update
 from sb3_crpn.cubic import solve_dense
 from tests.envs import Drift, Sampler
 from tests.oracle import paper_estimates
+from tests.policies import frozen_episodes, small_policy
 from tests.training import TrainLog, both, make, same, several, tensors
 
 METRICS = pytest.mark.parametrize("metric", ["fisher", "euclidean"])
@@ -206,6 +207,40 @@ def test_earlier_rollouts_of_the_same_call_join_an_update(algorithm, monkeypatch
     batches.sizes.clear()
     model.learn(10)
     assert batches.sizes[0] == (3, 2)
+
+
+@both
+def test_steps_are_shorter_where_advantages_have_almost_vanished(algorithm):
+    model = make(algorithm, target_kl=0.02)
+    batch = frozen_episodes(small_policy("discrete")[0], lengths=(3, 1, 4, 2))
+    advantages = np.linspace(-1.0, 1.0, batch.n_steps)
+
+    def target(scale):
+        return model._scaled_target_kl(
+            dataclasses.replace(batch, returns=batch.values + scale * advantages)
+        )
+
+    assert target(100.0) == 0.02
+    assert target(0.2 * 99.1) == pytest.approx(0.02)  # of a maximum that fades by 1 % an update
+    assert target(2.0) == pytest.approx(0.02 * 2.0 / (0.2 * 100.0 * 0.99**2))
+    assert target(1e-9) == pytest.approx(0.02 * 1e-3)
+    assert target(np.nan) == 0.02
+    assert target(1e9) == 0.02
+    assert target(100.0) == pytest.approx(0.02 * 1e-3)
+    for _ in range(2000):
+        last = target(100.0)
+    assert last == 0.02  # that outlier is forgotten
+    assert make(algorithm, target_kl=None)._scaled_target_kl(batch) is None
+
+
+@both
+def test_the_target_of_each_update_is_logged_and_kept(algorithm):
+    log = TrainLog()
+    make(algorithm, Sampler(NUMBERS, spaces.Discrete(2)), target_kl=0.02).learn(200, log)
+    assert log["target_kl"][0] == 0.02
+    assert all(
+        kl <= target for kl, target in zip(log["kl_divergence"], log["target_kl"], strict=True)
+    )
 
 
 def replaced(algorithm, change):

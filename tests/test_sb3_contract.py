@@ -438,6 +438,7 @@ def test_loaded_model_goes_on_as_if_it_had_not_stopped(algorithm, settings, tmp_
     assert same(second, parameters)
     assert all(torch.equal(a, b) for a, b in zip(moments, same_moments, strict=True))
     assert second._fitted_alpha == first._fitted_alpha
+    assert second._advantage_scale == first._advantage_scale
     assert second._mean_episode_length == first._mean_episode_length
     assert second._rng.random() == first._rng.random()
 

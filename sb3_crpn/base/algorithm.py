@@ -64,8 +64,9 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         α of the cubic term, a float or a schedule. With ``target_kl`` only the first guess.
     target_kl
         Mean KL divergence KL(old ‖ new) that each step keeps, met within 10 % by the choice of α;
-        the mean is over states and action components, as in sb3-contrib's TRPO. ``None``: α
-        follows its schedule.
+        the mean is over states and action components, as in sb3-contrib's TRPO. Less, in
+        proportion, where the standard deviation of the advantages falls below a fifth of its
+        recent maximum. ``None``: α follows its schedule.
     metric
         "fisher": M = F + εI; "euclidean": M = I, the paper's.
     fisher_damping
@@ -222,6 +223,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         self.n_critic_updates = n_critic_updates
         self.max_batch_timesteps = max_batch_timesteps
         self._fitted_alpha: float | None = None  # the last α that met target_kl
+        self._advantage_scale = 0.0  # the largest standard deviation of advantages, fading
         if _init_setup_model:
             self._setup_model()
 

@@ -40,6 +40,13 @@ from sb3_crpn.parameters import ActorParameters
 # appendix C, whose step H = 0 then reproduces.
 KRYLOV_DIM = 10
 
+# Steps are shortened where the advantages' standard deviation is below this fraction of its recent
+# maximum, which fades by the factor MEMORY an update
+FULL_SIGNAL = 0.2
+MEMORY = 0.99
+# The shortest: a KL divergence that single precision still tells from 0
+MIN_SIGNAL = 1e-3
+
 
 class PolicyNewtonUpdate(EpisodeCollection):
     """The update of DESIGN section 5; the subclass brings the arguments and the solver."""
@@ -63,6 +70,7 @@ class PolicyNewtonUpdate(EpisodeCollection):
     n_critic_updates: int
     _rng: np.random.Generator
     _fitted_alpha: float | None
+    _advantage_scale: float
 
     def train(self) -> None:
         """Update the policy from the episodes just collected (DESIGN section 5)."""
@@ -72,13 +80,14 @@ class PolicyNewtonUpdate(EpisodeCollection):
         earlier = self.earlier_rollouts.reweighted(self.policy, **self._weighting)
         estimate = self._estimate(batch, earlier)
         model = self._local_model(estimate)
-        step = self._take_step(estimate.gradient_batch, model)
+        target_kl = self._scaled_target_kl(batch)
+        step = self._take_step(estimate.gradient_batch, model, target_kl)
         value_loss = self._fit_critic(batch, earlier)
         if step.trial.finite:  # what spoilt one step would spoil the next ones
             self.earlier_rollouts.append(batch)
         broadcast_state(self.policy)
         self._n_updates += 1
-        self._log_update(batch, len(earlier), estimate, model, step, value_loss)
+        self._log_update(batch, len(earlier), estimate, model, step, target_kl, value_loss)
 
     def estimate_curvature(self, n_episodes: int, env: VecEnv | None = None) -> CurvatureEstimate:
         """Estimate gradient and Hessian of J at the current policy from fresh episodes.
@@ -185,19 +194,39 @@ class PolicyNewtonUpdate(EpisodeCollection):
         """Minimise the cubic model: what CRPN and ACRPN differ in."""
         raise NotImplementedError
 
-    def _take_step(self, batch: EpisodeBatch, model: LocalModel) -> PolicyStep:
+    def _scaled_target_kl(self, batch: EpisodeBatch) -> float | None:
+        """Return δ_k = δ min(1, σ_k / (σ̄_k / 5)), σ̄_k = max(σ_k, 0.99 σ̄_{k-1}), δ = ``target_kl``.
+
+        σ_k is the standard deviation of the advantages. Once a task is solved it falls by orders
+        of magnitude, and what is left is the critic's error. A cubic step's KL divergence is
+        proportional to the gradient, but one that is fitted to a target follows that error as
+        far as it followed the returns.
+        """
+        if self.target_kl is None:
+            return None
+        deviation = math.sqrt(mean_and_variance(batch.returns - batch.values)[1])
+        if not math.isfinite(deviation):  # nor is the step, which is rejected
+            return self.target_kl
+        self._advantage_scale = max(deviation, MEMORY * self._advantage_scale)
+        full = FULL_SIGNAL * self._advantage_scale
+        signal = deviation / full if full else 1.0
+        return self.target_kl * min(1.0, max(MIN_SIGNAL, signal))
+
+    def _take_step(
+        self, batch: EpisodeBatch, model: LocalModel, target_kl: float | None
+    ) -> PolicyStep:
         """Choose α, move the actor, and move it back if the step is no good."""
         alpha = self.alpha_schedule(self._current_progress_remaining)
-        if self.target_kl is not None and self._fitted_alpha is not None:
+        if target_kl is not None and self._fitted_alpha is not None:
             alpha = self._fitted_alpha
         step = take_step(
             StepTester(self.policy, self.actor, batch, self.max_batch_timesteps),
             model,
             lambda alpha: self._solve(model, alpha),
             alpha,
-            self.target_kl,
+            target_kl,
         )
-        if self.target_kl is not None and step.trial.finite:
+        if target_kl is not None and step.trial.finite:
             self._fitted_alpha = step.alpha
         return step
 
@@ -225,6 +254,7 @@ class PolicyNewtonUpdate(EpisodeCollection):
         estimate: CurvatureEstimate,
         model: LocalModel,
         step: PolicyStep,
+        target_kl: float | None,
         value_loss: float | None,
     ) -> None:
         assert isinstance(self.rollout_buffer, EpisodeRolloutBuffer)  # by _setup_model
@@ -240,6 +270,8 @@ class PolicyNewtonUpdate(EpisodeCollection):
             "used_timesteps_fraction": self.rollout_buffer.used_fraction,
             "explained_variance": _explained_variance(batch),
         }
+        if target_kl is not None:
+            values["target_kl"] = target_kl
         if value_loss is not None:
             values["value_loss"] = value_loss
         if hasattr(self.policy, "log_std"):
