@@ -222,11 +222,11 @@ def test_steps_are_shorter_where_advantages_have_almost_vanished(algorithm):
 
     assert target(100.0) == 0.02
     assert target(0.2 * 99.1) == pytest.approx(0.02)  # of a maximum that fades by 1 % an update
-    assert target(2.0) == pytest.approx(0.02 * 2.0 / (0.2 * 100.0 * 0.99**2))
-    assert target(1e-9) == pytest.approx(0.02 * 1e-3)
+    assert target(2.0) == pytest.approx(0.02 * (2.0 / (0.2 * 100.0 * 0.99**2)) ** 2)
+    assert target(1e-9) == pytest.approx(0.02 * 1e-4)
     assert target(np.nan) == 0.02
     assert target(1e9) == 0.02
-    assert target(100.0) == pytest.approx(0.02 * 1e-3)
+    assert target(100.0) == pytest.approx(0.02 * 1e-4)
     for _ in range(2000):
         last = target(100.0)
     assert last == 0.02  # that outlier is forgotten

@@ -64,9 +64,9 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         α of the cubic term, a float or a schedule. With ``target_kl`` only the first guess.
     target_kl
         Mean KL divergence KL(old ‖ new) that each step keeps, met within 10 % by the choice of α;
-        the mean is over states and action components, as in sb3-contrib's TRPO. Less, in
-        proportion, where the standard deviation of the advantages falls below a fifth of its
-        recent maximum. ``None``: α follows its schedule.
+        the mean is over states and action components, as in sb3-contrib's TRPO. Where the
+        standard deviation of the advantages falls below a fifth of its recent maximum, steps are
+        shorter in proportion. ``None``: α follows its schedule.
     metric
         "fisher": M = F + εI; "euclidean": M = I, the paper's.
     fisher_damping

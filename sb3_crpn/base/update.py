@@ -44,8 +44,8 @@ KRYLOV_DIM = 10
 # maximum, which fades by the factor MEMORY an update
 FULL_SIGNAL = 0.2
 MEMORY = 0.99
-# The shortest: a KL divergence that single precision still tells from 0
-MIN_SIGNAL = 1e-3
+# The shortest, a hundredth: its KL divergence can still be told from 0 in single precision
+MIN_SIGNAL = 1e-2
 
 
 class PolicyNewtonUpdate(EpisodeCollection):
@@ -195,12 +195,11 @@ class PolicyNewtonUpdate(EpisodeCollection):
         raise NotImplementedError
 
     def _scaled_target_kl(self, batch: EpisodeBatch) -> float | None:
-        """Return δ_k = δ min(1, σ_k / (σ̄_k / 5)), σ̄_k = max(σ_k, 0.99 σ̄_{k-1}), δ = ``target_kl``.
+        """Return δ_k = δ min(1, 5σ_k/σ̄_k)², σ̄_k = max(σ_k, 0.99 σ̄_{k-1}), δ = ``target_kl``.
 
         σ_k is the standard deviation of the advantages. Once a task is solved it falls by orders
-        of magnitude, and what is left is the critic's error. A cubic step's KL divergence is
-        proportional to the gradient, but one that is fitted to a target follows that error as
-        far as it followed the returns.
+        of magnitude, and what is left is the critic's error, which a step that is fitted to a
+        target follows as far as it followed the returns. This one's length is in proportion to σ_k.
         """
         if self.target_kl is None:
             return None
@@ -210,7 +209,7 @@ class PolicyNewtonUpdate(EpisodeCollection):
         self._advantage_scale = max(deviation, MEMORY * self._advantage_scale)
         full = FULL_SIGNAL * self._advantage_scale
         signal = deviation / full if full else 1.0
-        return self.target_kl * min(1.0, max(MIN_SIGNAL, signal))
+        return self.target_kl * min(1.0, max(MIN_SIGNAL, signal)) ** 2
 
     def _take_step(
         self, batch: EpisodeBatch, model: LocalModel, target_kl: float | None
