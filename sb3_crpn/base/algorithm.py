@@ -222,8 +222,6 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         self.batch_size = batch_size
         self.n_critic_updates = n_critic_updates
         self.max_batch_timesteps = max_batch_timesteps
-        self._fitted_alpha: float | None = None  # the last α that met target_kl
-        self._advantage_scale = 0.0  # the largest standard deviation of advantages, fading
         if _init_setup_model:
             self._setup_model()
 

@@ -69,8 +69,8 @@ class PolicyNewtonUpdate(EpisodeCollection):
     batch_size: int
     n_critic_updates: int
     _rng: np.random.Generator
-    _fitted_alpha: float | None
-    _advantage_scale: float
+    _fitted_alpha: float | None = None  # the last α that met target_kl
+    _advantage_scale = 0.0  # the largest standard deviation of advantages, fading
 
     def train(self) -> None:
         """Update the policy from the episodes just collected (DESIGN section 5)."""
