@@ -210,14 +210,14 @@ def test_earlier_rollouts_of_the_same_call_join_an_update(algorithm, monkeypatch
 
 
 @both
-def test_steps_are_shorter_where_advantages_have_almost_vanished(algorithm):
+def test_steps_are_shorter_where_returns_hardly_differ(algorithm):
     model = make(algorithm, target_kl=0.02)
     batch = frozen_episodes(small_policy("discrete")[0], lengths=(3, 1, 4, 2))
-    advantages = np.linspace(-1.0, 1.0, batch.n_steps)
+    differences = np.linspace(-1.0, 1.0, batch.n_steps)
 
     def target(scale):
         return model._scaled_target_kl(
-            dataclasses.replace(batch, returns=batch.values + scale * advantages)
+            dataclasses.replace(batch, returns=7.0 + scale * differences)
         )
 
     assert target(100.0) == 0.02
@@ -231,6 +231,21 @@ def test_steps_are_shorter_where_advantages_have_almost_vanished(algorithm):
         last = target(100.0)
     assert last == 0.02  # that outlier is forgotten
     assert make(algorithm, target_kl=None)._scaled_target_kl(batch) is None
+
+
+@pytest.mark.parametrize("norm_reward", [False, True])
+def test_returns_are_compared_in_the_units_of_the_environment(norm_reward):
+    env = VecNormalize(several(2, dim=2), norm_reward=norm_reward)
+    model = make(CRPN, env, target_kl=0.02)
+    batch = frozen_episodes(small_policy("discrete")[0], lengths=(3, 1, 4, 2))
+
+    def target(variance):  # of the same returns
+        env.ret_rms.var = np.array(variance)
+        return model._scaled_target_kl(batch)
+
+    assert target(1.0) == 0.02
+    shorter = 0.02 * (0.01 / (0.2 * 0.99)) ** 2
+    assert target(1e-4) == pytest.approx(shorter if norm_reward else 0.02, rel=1e-3)
 
 
 @both

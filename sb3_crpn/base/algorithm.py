@@ -65,7 +65,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
     target_kl
         Mean KL divergence KL(old ‖ new) that each step keeps, met within 10 % by the choice of α;
         the mean is over states and action components, as in sb3-contrib's TRPO. Where the
-        standard deviation of the advantages falls below a fifth of its recent maximum, steps are
+        standard deviation of the λ-returns falls below a fifth of its recent maximum, steps are
         shorter in proportion. ``None``: α follows its schedule.
     metric
         "fisher": M = F + εI; "euclidean": M = I, the paper's.

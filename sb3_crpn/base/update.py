@@ -40,7 +40,7 @@ from sb3_crpn.parameters import ActorParameters
 # appendix C, whose step H = 0 then reproduces.
 KRYLOV_DIM = 10
 
-# Steps are shortened where the advantages' standard deviation is below this fraction of its recent
+# Steps are shortened where the returns' standard deviation is below this fraction of its recent
 # maximum, which fades by the factor MEMORY an update
 FULL_SIGNAL = 0.2
 MEMORY = 0.99
@@ -70,7 +70,7 @@ class PolicyNewtonUpdate(EpisodeCollection):
     n_critic_updates: int
     _rng: np.random.Generator
     _fitted_alpha: float | None = None  # the last α that met target_kl
-    _advantage_scale = 0.0  # the largest standard deviation of advantages, fading
+    _return_scale = 0.0  # the largest standard deviation of the returns, fading
 
     def train(self) -> None:
         """Update the policy from the episodes just collected (DESIGN section 5)."""
@@ -197,19 +197,28 @@ class PolicyNewtonUpdate(EpisodeCollection):
     def _scaled_target_kl(self, batch: EpisodeBatch) -> float | None:
         """Return δ_k = δ min(1, 5σ_k/σ̄_k)², σ̄_k = max(σ_k, 0.99 σ̄_{k-1}), δ = ``target_kl``.
 
-        σ_k is the standard deviation of the advantages. Once a task is solved it falls by orders
-        of magnitude, and what is left is the critic's error, which a step that is fitted to a
-        target follows as far as it followed the returns. This one's length is in proportion to σ_k.
+        σ_k is the standard deviation of the λ-returns, in the units that the rewards had before
+        ``VecNormalize``. Once a task is solved all episodes are alike and σ_k falls by orders of
+        magnitude: what is left to the advantages is the critic's error, which a step that is
+        fitted to a target follows as far as it followed the returns. This one's length is in
+        proportion to σ_k.
         """
         if self.target_kl is None:
             return None
-        deviation = math.sqrt(mean_and_variance(batch.returns - batch.values)[1])
+        deviation = self._reward_unit() * math.sqrt(mean_and_variance(batch.returns)[1])
         if not math.isfinite(deviation):  # nor is the step, which is rejected
             return self.target_kl
-        self._advantage_scale = max(deviation, MEMORY * self._advantage_scale)
-        full = FULL_SIGNAL * self._advantage_scale
+        self._return_scale = max(deviation, MEMORY * self._return_scale)
+        full = FULL_SIGNAL * self._return_scale
         signal = deviation / full if full else 1.0
         return self.target_kl * min(1.0, max(MIN_SIGNAL, signal)) ** 2
+
+    def _reward_unit(self) -> float:
+        """Return what a reward of 1 stands for in the environment: not 1 under VecNormalize."""
+        normalizer = self.get_vec_normalize_env()
+        if normalizer is None or not normalizer.norm_reward:
+            return 1.0
+        return math.sqrt(float(normalizer.ret_rms.var) + normalizer.epsilon)
 
     def _take_step(
         self, batch: EpisodeBatch, model: LocalModel, target_kl: float | None
