@@ -51,6 +51,18 @@ class Comparison:
         )
 
     @property
+    def learners(self) -> list[str]:
+        """Algorithms but for the random policy."""
+        return [label for label in self.labels if label != RANDOM]
+
+    @property
+    def complete_learners(self) -> list[str]:
+        """Algorithms that ran wherever the baseline did."""
+        tasks = self.runs.groupby("label")["task"].agg(set)
+        needed = tasks.get(self.baseline, set())
+        return [label for label in self.learners if needed <= tasks[label]]
+
+    @property
     def tasks(self) -> list[str]:
         """Environments, in the benchmark's order."""
         order = {env: i for i, env in enumerate(BUDGETS)}

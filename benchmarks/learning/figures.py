@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from benchmarks.learning.comparison import METRICS, Comparison
-from benchmarks.learning.settings import RANDOM
 from benchmarks.learning.statistics import (
     Array,
     Estimate,
@@ -63,8 +62,11 @@ def _draw_curve(ax: Axes, comparison: Comparison, label: str, task: str) -> None
 
 
 def save_aggregate(comparison: Comparison, path: Path) -> None:
-    """Draw interquartile means, performance profile and probability of improvement."""
-    labels = [label for label in comparison.labels if label != RANDOM]
+    """Draw interquartile means, performance profile and probability of improvement.
+
+    They are of the algorithms that ran wherever the baseline did.
+    """
+    labels = comparison.complete_learners
     figure, (left, middle, right) = _figure(1, 3, size=(12, 3.8))
     for i, metric in enumerate(METRICS):
         tasks = comparison.comparable_tasks(labels, metric)

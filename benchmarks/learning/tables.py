@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from benchmarks.learning.comparison import METRICS, Comparison
@@ -26,17 +28,22 @@ def report(comparison: Comparison) -> str:
     ]
     if comparison.n_outdated:
         parts.append(f"{comparison.n_outdated} runs with outdated hyperparameters are left out.")
-    parts += ["## Aggregate", aggregate_table(comparison)]
+    parts += ["## Aggregate", aggregate_table(comparison, comparison.complete_learners)]
+    if comparison.complete_learners != comparison.learners:
+        parts += [
+            f"Fewer environments, on which algorithms ran that did not on all of "
+            f"{comparison.baseline}'s:",
+            aggregate_table(comparison, comparison.learners),
+        ]
     parts += ["## Each environment", task_table(comparison)]
     parts += ["## Cost", cost_table(comparison)]
     parts += ["## Hyperparameters", entry_table(comparison)]
     return "\n\n".join(parts) + "\n"
 
 
-def aggregate_table(comparison: Comparison) -> str:
+def aggregate_table(comparison: Comparison, labels: Sequence[str]) -> str:
     """Return interquartile means of normalised scores and probabilities of improvement."""
     baseline = comparison.baseline
-    labels = [label for label in comparison.labels if label != RANDOM]
     notes, columns = [], []
     for metric, name in METRICS.items():
         tasks = comparison.comparable_tasks(labels, metric)
@@ -114,8 +121,7 @@ def cost_table(comparison: Comparison) -> str:
 
 def entry_table(comparison: Comparison) -> str:
     """Return where the hyperparameters come from."""
-    labels = [label for label in comparison.labels if label != RANDOM]
-    runs = comparison.runs
+    labels, runs = comparison.learners, comparison.runs
     rows = [["environment", *labels]]
     for task in comparison.tasks:
         entries = [runs[(runs.task == task) & (runs.label == label)].entry for label in labels]

@@ -188,6 +188,18 @@ def test_tables_say_what_the_rows_say(results: Path) -> None:
     assert "| CRPN | 1.81 " in text  # 56 / 31
 
 
+def test_an_algorithm_of_fewer_environments_is_compared_apart(results: Path) -> None:
+    complete = tables.report(comparison.load(results, "TRPO"))
+    assert "Fewer environments" not in complete
+    store.append(results, _run("PPO", 0), _result(30.0, np.full(50, 30.0)))
+    found = comparison.load(results, "TRPO")
+    assert found.complete_learners == ["CRPN", "TRPO"]
+    assert found.learners == ["CRPN", "PPO", "TRPO"]
+    all_environments, fewer = tables.report(found).split("Fewer environments")
+    assert "| PPO | " not in all_environments
+    assert "| PPO | 0.32 " in fewer  # 10 / 31
+
+
 def test_interquartile_mean_is_scipys_for_equal_numbers_of_seeds() -> None:
     rng = np.random.default_rng(0)
     samples = list(rng.normal(size=(4, 6)))
