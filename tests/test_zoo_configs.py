@@ -67,8 +67,11 @@ def test_keys_are_arguments(algo, name):
 def test_entries_build_models(env_id):
     env = gym.make(env_id)
     for algo, algorithm in ALGORITHMS.items():
-        arguments = entries(algo)[env_id]
-        algorithm(env=env, **{k: v for k, v in arguments.items() if k not in RL_ZOO})
+        entry = entries(algo)[env_id]
+        arguments = {key: value for key, value in entry.items() if key not in RL_ZOO}
+        if "policy_kwargs" in arguments:  # text, which rl-zoo evaluates
+            arguments["policy_kwargs"] = eval(arguments["policy_kwargs"], {"nn": nn})
+        algorithm(env=env, **arguments)
     env.close()
 
 
