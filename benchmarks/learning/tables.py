@@ -113,8 +113,8 @@ def cost_table(comparison: Comparison) -> str:
                 cells.append(mean_cell(comparison.paired_ratios(label, task, column), digits=2))
             rows.append([task, label, *cells])
     text = (
-        "Training alone, one thread. Ratios are of runs with the same seed, which ran next to each "
-        "other; other work on the machine moves wall time, CPU time less."
+        "Training alone, one thread. Ratios are of runs with the same seed: of one command, they "
+        "ran next to each other. Other work on the machine moves wall time, CPU time less."
     )
     return text + "\n\n" + _markdown(rows)
 

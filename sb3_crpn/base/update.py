@@ -214,7 +214,7 @@ class PolicyNewtonUpdate(EpisodeCollection):
         return self.target_kl * min(1.0, max(MIN_SIGNAL, signal)) ** 2
 
     def _reward_unit(self) -> float:
-        """Return what a reward of 1 stands for in the environment: not 1 under VecNormalize."""
+        """Return what ``VecNormalize`` divides rewards by, √(Var[Σγ^h r_h] + ε); else 1."""
         normalizer = self.get_vec_normalize_env()
         if normalizer is None or not normalizer.norm_reward:
             return 1.0
