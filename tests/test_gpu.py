@@ -1,12 +1,14 @@
 """The same on a GPU as on the CPU."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+import torch.distributed as dist
 
-from sb3_crpn import CRPN
+from sb3_crpn import CRPN, distributed
 from sb3_crpn.base.critic import fit_critic
 from sb3_crpn.base.trial import StepTester
 from sb3_crpn.cubic import solve_krylov
@@ -14,7 +16,8 @@ from sb3_crpn.curvature import PairWeights, estimate_curvature, full_model, proj
 from sb3_crpn.parameters import ActorParameters
 from tests.envs import Drift
 from tests.policies import ACTION_SPACES, frozen_episodes, log_probabilities, small_policy
-from tests.training import TrainLog, all_finite, both, make
+from tests.ranks import run_ranks
+from tests.training import TrainLog, all_finite, both, make, several
 
 pytestmark = [
     pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
@@ -102,3 +105,41 @@ def test_a_loaded_model_goes_on_with_the_noise_where_it_stopped(tmp_path):
     assert not torch.equal(torch.cuda.get_rng_state(), state)
     loaded.learn(0, reset_num_timesteps=False)
     assert torch.equal(torch.cuda.get_rng_state(), state)
+
+
+def on_a_shared_gpu(folder):
+    """What this rank has learnt after some updates."""
+    assert dist.get_backend() == "gloo"  # two ranks of one GPU
+    model = make(CRPN, several(2), device="cuda").learn(400)
+    return model._n_updates, model.actor.vector.cpu(), model.num_timesteps
+
+
+def nccl_messages(folder):
+    """Reduce and broadcast what ranks send, over NCCL, with this process the only rank."""
+    torch.cuda.set_device(0)
+    dist.init_process_group("cpu:gloo,cuda:nccl", rank=0, world_size=1)
+    results = []
+    for device, dtype in itertools.product(
+        ("cpu", "cuda"), (torch.float32, torch.float64, torch.int64)
+    ):
+        sent = torch.arange(5, dtype=dtype, device=device)
+        received = sent.clone()
+        dist.broadcast(received, 0)
+        results.append((sent, received, distributed._reduce(sent, dist.ReduceOp.SUM)))
+    return [[tensor.cpu() for tensor in result] for result in results]
+
+
+@pytest.mark.skipif(torch.cuda.device_count() > 1, reason="each rank would have a GPU of its own")
+def test_ranks_that_share_a_gpu_take_the_same_steps(tmp_path):
+    codes, [results] = run_ranks([on_a_shared_gpu], tmp_path)
+    assert codes == [0, 0]
+    assert results[0][0] >= 3
+    assert torch.equal(results[0][1], results[1][1])
+    assert results[0][::2] == results[1][::2]
+
+
+def test_nccl_takes_every_message(tmp_path):
+    codes, [[results]] = run_ranks([nccl_messages], tmp_path, n_ranks=1)
+    assert codes == [0]
+    for sent, *received in results:
+        assert all(torch.equal(tensor, sent) for tensor in received)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -16,39 +17,42 @@ from sb3_crpn import CRPN
 from sb3_crpn.sosp import certify_sosp
 
 SHAPE = "HalfCheetah-v5"
-DEVICES = {"CPU": "cpu", "GPU": "cuda"}
+# Hidden width and timesteps of the batch
+SIZES = ((64, 2_000), (64, 16_000), (256, 2_000), (1024, 2_000))
 
 
 def measure(
-    repeats: int = 10,
-    widths: Sequence[int] = (64, 256, 1024),
-    n_steps: int = 4_000,
-    n_episodes: int = 4,
+    repeats: int = 4, sizes: Sequence[tuple[int, int]] = SIZES, episode: int = 500
 ) -> list[Row]:
-    """Compare both devices at several hidden widths, or say why that was not possible.
+    """Compare the GPU with one core and with all of them, or say why that was not possible.
 
-    The wall clock is the one to read: a GPU works while the process waits. The CPU computes in one
-    thread, as everywhere in this package.
+    The wall clock is the one to read: a GPU works while the process waits.
     """
     if not torch.cuda.is_available():
         return [{"skipped": "torch.cuda.is_available() is False: there is no GPU to compare with"}]
     rows = []
-    for width in widths:
-        models = {name: _model(device, width, n_steps) for name, device in DEVICES.items()}
+    for width, n_steps in sizes:
+        on_cpu, on_gpu = (_model(device, width, n_steps, episode) for device in ("cpu", "cuda"))
         builders: dict[str, Callable[[CRPN], Task]] = {
             "Hessian product": _product,
             "update": _update,
-            "certificate": lambda model: _certificate(model, n_episodes),
+            "certificate": _certificate,
         }
         for name, build in builders.items():
-            tasks = {device: synchronised(build(model)) for device, model in models.items()}
-            case = {"task": name, "width": width, "d": len(models["CPU"].actor), "T": n_steps}
-            rows.append(compare(case, tasks, "CPU", repeats))
+            case = {"task": name, "width": width, "d": len(on_cpu.actor), "T": n_steps}
+            alone = build(on_cpu)
+            n_cores = os.cpu_count() or 1
+            tasks = {
+                "1 core": alone,
+                f"{n_cores} cores": threaded(alone, n_cores),
+                "GPU": synchronised(build(on_gpu)),
+            }
+            rows.append(compare(case, tasks, "1 core", repeats, warm_ups=1))
     return rows
 
 
-def _model(device: str, width: int, n_steps: int) -> CRPN:
-    arguments: dict[str, Any] = {"device": device, "width": width}
+def _model(device: str, width: int, n_steps: int, episode: int) -> CRPN:
+    arguments: dict[str, Any] = {"device": device, "width": width, "episode": episode}
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="You are trying to run .* on the GPU")
         return noise_model(CRPN, SHAPE, n_steps, **arguments)
@@ -66,11 +70,26 @@ def _update(model: CRPN) -> Task:
     return update_task(model, critic=True)
 
 
-def _certificate(model: CRPN, n_episodes: int) -> Task:
+def _certificate(model: CRPN) -> Task:
+    """Return the certificate from as many timesteps as the update's, one episode an environment."""
+
     def run() -> None:
-        certify_sosp(model, n_episodes, epsilon=1.0, seed=0)
+        certify_sosp(model, model.n_envs, epsilon=1.0, seed=0)
 
     return Task(run)
+
+
+def threaded(task: Task, n_threads: int) -> Task:
+    """Return the task with torch computing in so many threads, one again after it."""
+
+    def run() -> float | None:
+        torch.set_num_threads(n_threads)
+        try:
+            return task.run()
+        finally:
+            torch.set_num_threads(1)
+
+    return Task(run, task.prepare)
 
 
 def synchronised(task: Task) -> Task:

@@ -17,6 +17,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_crpn.base.arguments import check_arguments, check_sb3_arguments
+from sb3_crpn.base.critic import fuse
 from sb3_crpn.base.random_state import RandomState
 from sb3_crpn.base.update import PolicyNewtonUpdate
 from sb3_crpn.curvature.scores import HessianEstimator
@@ -233,6 +234,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
                 DictEpisodeRolloutBuffer if is_dict else EpisodeRolloutBuffer
             )
         super()._setup_model()
+        fuse(self.policy.optimizer)
         self.alpha_schedule = FloatSchedule(self.alpha)
         self.earlier_rollouts = EarlierRollouts(self.n_reused_rollouts, self.gamma, self.gae_lambda)
         self.actor = self._find_actor()

@@ -19,9 +19,10 @@ from sb3_crpn.parameters import ActorParameters
 # them would run smaller, less efficient products.
 N_GROUPS = 2
 
-# Steps of one graph: enough to be efficient, few enough for a processor's cache. With 100,000 steps
-# a Hessian product took 0.93 times as long as in two graphs, a Fisher product 0.85 times.
-RUN_STEPS = 4096
+# Steps of one graph on a CPU: enough to be efficient, few enough for its cache. With 100,000 steps
+# a Hessian product took 0.93 times as long as in two graphs, a Fisher product 0.85 times. A GPU
+# waits for its kernels to be launched, and gets one graph a group.
+CPU_RUN_STEPS = 4096
 
 # VᵀBV of more columns is made from products, whose memory does not grow with columns × timesteps
 MAX_FORM_COLUMNS = 128
@@ -37,9 +38,9 @@ class NoiseGroups:
     policy, actor, batch, pair_weights
         As :class:`EpisodeGroup` takes them; ``batch`` holds this rank's episodes, possibly none.
     max_steps
-        The groups are sums over runs of episodes of at most ``RUN_STEPS`` steps. ``None``: the
-        runs' graphs are kept for every product. Otherwise they live for one product and hold at
-        most so many steps.
+        The groups are sums over runs of episodes, on a CPU of at most ``CPU_RUN_STEPS`` steps.
+        ``None``: the runs' graphs are kept for every product. Otherwise they live for one product
+        and hold at most so many steps.
 
     Attributes
     ----------
@@ -67,7 +68,9 @@ class NoiseGroups:
 
             return cache(open_run) if max_steps is None else open_run
 
-        limit = RUN_STEPS if max_steps is None else min(max_steps, RUN_STEPS)
+        limit = batch.n_steps if max_steps is None else max_steps
+        if actor.device.type == "cpu":
+            limit = min(limit, CPU_RUN_STEPS)
         self._groups = [
             [run(episodes[part]) for part in episode_runs(batch.lengths[episodes], limit)]
             for episodes in dealt

@@ -1,3 +1,4 @@
+import copy
 from dataclasses import replace
 
 import gymnasium as gym
@@ -11,7 +12,7 @@ from torch import nn
 
 from sb3_crpn import CRPN
 from sb3_crpn.base import update
-from sb3_crpn.base.critic import fit_critic
+from sb3_crpn.base.critic import fit_critic, fuse
 from sb3_crpn.parameters import ActorParameters
 from tests.policies import ACTION_SPACES, OBSERVATION_SPACE, frozen_episodes
 
@@ -163,3 +164,38 @@ def test_earlier_rollouts_share_in_the_minibatches_of_the_fresh_one(monkeypatch)
     assert sizes == sorted(sizes)
     assert sizes[-1] > sizes[0]
     assert {options["n_minibatches"] for _, options in passes} == {3}
+
+
+def test_fused_steps_are_adams(shared):
+    policy, actor, batch = shared
+    start = copy.deepcopy(policy.state_dict())
+    results = []
+    for fused in (False, True):
+        policy.load_state_dict(start)
+        policy.optimizer = torch.optim.Adam(policy.parameters(), lr=1e-2)
+        if fused:
+            fuse(policy.optimizer)
+        assert bool(policy.optimizer.param_groups[0]["fused"]) is fused
+        fit(policy, actor, batch, n_epochs=3)
+        results.append(copy.deepcopy(policy.state_dict()))
+    torch.testing.assert_close(*results, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("optimizer", "kwargs"),
+    [("Adam", {"fused": False}), ("Adam", {"foreach": True}), ("RMSprop", {}), ("SGD", {})],
+)
+def test_an_optimiser_with_a_way_of_its_own_keeps_it(optimizer, kwargs):
+    parameters = [nn.Parameter(torch.zeros(2))]
+    ours = getattr(torch.optim, optimizer)(parameters, lr=0.1, **kwargs)
+    expected = {k: v for k, v in ours.param_groups[0].items() if k != "params"}
+    fuse(ours)
+    assert {k: v for k, v in ours.param_groups[0].items() if k != "params"} == expected
+
+
+def test_models_use_fused_adam_also_when_loaded(tmp_path):
+    model = CRPN("MlpPolicy", "CartPole-v1", n_steps=64, device="cpu", seed=0).learn(64)
+    model.save(tmp_path / "model")
+    loaded = CRPN.load(tmp_path / "model", device="cpu")
+    for each in (model, loaded):
+        assert each.policy.optimizer.param_groups[0]["fused"]

@@ -24,7 +24,7 @@ TINY = {
     "solves": {"repeats": 1, "dense": (5, 8), "krylov": (10, 20)},
     "scaling": {"repeats": 2, "timesteps": (20, 40), "parameters": (100, 200), "n_steps": 20},
     "memory": {"timesteps": (50, 100), "parameters": (100,), "updates": (60,)},
-    "device": {"repeats": 1, "widths": (4,), "n_steps": 40},
+    "device": {"repeats": 1, "sizes": ((4, 40),), "episode": 10},
 }
 
 
