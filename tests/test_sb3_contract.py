@@ -280,6 +280,41 @@ def test_hooks_and_timesteps(algorithm):
     assert sum(drift.total for drift in env.envs) == model.num_timesteps
 
 
+@both
+@pytest.mark.parametrize(
+    ("arguments", "simulated", "learnt_from"),
+    [
+        ({"n_steps": 40}, 20 + 80, 8),  # two episodes tell how long they are
+        ({"n_steps": 12}, 20, 2),  # which is what was wanted anyway
+        ({"n_episodes": 8}, 80, 8),  # nobody asks
+    ],
+)
+def test_the_first_update_learns_from_as_much_as_the_others(
+    algorithm, arguments, simulated, learnt_from
+):
+    log, hooks = TrainLog(), Hooks()
+    env = several(2, bound=np.inf, limit=10)
+    model = make(algorithm, env, **arguments).learn(1, [log, hooks])
+    assert model.num_timesteps == simulated
+    assert log["n_episodes"] == [learnt_from]
+    assert log["used_timesteps_fraction"] == [1.0]
+    assert hooks.calls[1:-1] == ["rollout starts", f"rollout {simulated} ends"]
+    model.learn(1, log, reset_num_timesteps=False)
+    assert log["n_episodes"][1] == learnt_from
+
+
+@both
+def test_stopped_while_the_length_of_episodes_is_found_out(algorithm):
+    model = make(algorithm, several(2, bound=np.inf, limit=10), n_steps=40)
+    before = tensors(model)
+    model.learn(1000, StopAt(10))
+    assert model.num_timesteps == 10
+    assert same(model, before)
+    log = TrainLog()
+    model.learn(1, log, reset_num_timesteps=False)
+    assert log["n_episodes"] == [8]
+
+
 class StopAt(BaseCallback):
     def __init__(self, step):
         super().__init__()

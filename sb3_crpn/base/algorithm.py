@@ -51,7 +51,8 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         The critic's, a float or a schedule. The actor has none: its step is the cubic model's.
     n_steps
         Target timesteps per environment and update, met in whole episodes of the last update's
-        mean length (at least one per environment).
+        mean length (at least one per environment). Before the first update one episode of each
+        environment tells the length, and is not learnt from if more are to be run.
     n_episodes
         m_k, the episodes of the gradient: an int or a schedule; ``None``: from ``n_steps``.
     n_hessian_episodes

@@ -67,8 +67,8 @@ class EpisodeCollection(Ranks, OnPolicyAlgorithm):
         """Fill the buffer with whole episodes of the current policy.
 
         max(m_k, b_k) episodes are simulated; where neither is given, ``n_rollout_steps`` steps
-        per environment, in whole episodes at their last mean length. Each rank simulates its share
-        of them; only afterwards do the ranks add up their timesteps.
+        per environment, in whole episodes at their last mean length. Nobody knows it at first:
+        one episode of each environment tells, and is thrown away if more should have been run.
 
         Returns
         -------
@@ -82,24 +82,47 @@ class EpisodeCollection(Ranks, OnPolicyAlgorithm):
         """
         assert isinstance(rollout_buffer, EpisodeRolloutBuffer)  # set by _setup_model
         self._batch_sizes = self._scheduled_episodes()
+        callback.on_rollout_start()
+        lengths_unknown = self._mean_episode_length is None
+        n_episodes = self._n_episodes(n_rollout_steps, env.num_envs)
+        completed = self._collect_shares(env, callback, rollout_buffer, n_episodes)
+        if completed and lengths_unknown:
+            n_wanted = self._n_episodes(n_rollout_steps, env.num_envs)
+            if n_wanted > n_episodes:
+                completed = self._collect_shares(env, callback, rollout_buffer, n_wanted)
+        if completed:
+            callback.on_rollout_end()
+        return completed
+
+    def _n_episodes(self, n_steps: int, n_envs: int) -> int:
+        """Return how many episodes all ranks simulate, as far as episode lengths are known."""
         given = [number for number in self._batch_sizes if number is not None]
-        quota = steps_to_quota(n_rollout_steps, self._mean_episode_length)
         if self._batch_sizes[0] is None:
-            given.append(quota * env.num_envs * world_size())
-        quotas = episodes_per_env(share(max(given)), env.num_envs)
+            quota = steps_to_quota(n_steps, self._mean_episode_length)
+            given.append(quota * n_envs * world_size())
+        return max(given)
+
+    def _collect_shares(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: EpisodeRolloutBuffer,
+        n_episodes: int,
+    ) -> bool:
+        """Simulate this rank's share of the episodes; only afterwards ranks add up timesteps."""
+        quotas = episodes_per_env(share(n_episodes), env.num_envs)
         before = self.num_timesteps
         completed = self._collect_episodes(env, callback, rollout_buffer, quotas)
         lengths = rollout_buffer.lengths
         own = [not completed, self.num_timesteps - before, len(lengths), lengths.sum()]
-        stopped, n_simulated, n_episodes, n_kept = all_sum(
+        stopped, n_simulated, n_kept, n_steps = all_sum(
             torch.tensor(own, dtype=torch.float64)
         ).tolist()
         self.num_timesteps = before + int(n_simulated)
         self._share_statistics()
         if stopped:
             return False
-        self._mean_episode_length = n_kept / n_episodes
-        callback.on_rollout_end()
+        self._mean_episode_length = n_steps / n_kept
         return True
 
     def _collect_episodes(
@@ -147,7 +170,6 @@ class EpisodeCollection(Ranks, OnPolicyAlgorithm):
         rollout_buffer.reset()
         n_steps = last_end = 0
         unknown = torch.zeros(env.num_envs)  # V and log π: evaluated at the end, all at once
-        callback.on_rollout_start()
         while not tracker.complete:
             if self.use_sde and (
                 n_steps == 0 or (self.sde_sample_freq > 0 and n_steps % self.sde_sample_freq == 0)

@@ -19,6 +19,8 @@ from sb3_crpn.parameters import ActorParameters
 KL_TOLERANCE = 0.1
 # Bisection on log α: 40 trials narrow 30 decades to the tolerance
 MAX_TRIALS = 40
+# Below it the cubic term is lost in the rounding of the others; far below it, α is 0
+LOG_MIN_ALPHA = math.log(1e-30)
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,7 @@ def fit_alpha(kl: Callable[[float], float], alpha: float, target: float) -> floa
         else:
             low = log_alpha
         if math.isinf(low) or math.isinf(high):
-            log_alpha += _extrapolate(divergence, target)
+            log_alpha = max(LOG_MIN_ALPHA, log_alpha + _extrapolate(divergence, target))
         else:
             log_alpha = 0.5 * (low + high)
         if high - low < 1e-6:

@@ -48,9 +48,12 @@ def generalized_advantages(
     last = episode_starts(lengths) + lengths - 1
     next_values = np.append(values[1:], 0.0)
     next_values[last] = terminal_values
-    delta = rewards + gamma * next_values - values
     if traces is None:
-        return episode_scan(delta, gamma * gae_lambda, lengths, reverse=True)
+        # the λ-returns, then V: at λ = 1 nothing of V is left in the former, not even its rounding
+        sources = rewards + gamma * (1.0 - gae_lambda) * next_values
+        sources[last] += gamma * gae_lambda * terminal_values
+        return episode_scan(sources, gamma * gae_lambda, lengths, reverse=True) - values
+    delta = rewards + gamma * next_values - values
     if not len(delta):
         return delta
     # y_i - γλ c_{i+1} y_{i+1} = δ_i within each episode: one bidiagonal system

@@ -69,6 +69,11 @@ def test_a_step_of_length_zero_leaves_alpha_alone():
     assert law.trials <= 2
 
 
+def test_alpha_stays_positive_where_the_divergence_creeps_up_to_no_end():
+    law = Law(lambda alpha: 1e-9 * TARGET * 1.1**law.trials)
+    assert fit_alpha(law, 1.0, TARGET) == pytest.approx(1e-30)
+
+
 @pytest.mark.parametrize("start", [1e-3, 1.0, 1e4])
 def test_where_the_target_is_jumped_over_alpha_is_the_smallest_allowed(start):
     law = Law(lambda alpha: 5.0 * TARGET if alpha < 7.0 else 0.1 * TARGET * 7.0 / alpha)
