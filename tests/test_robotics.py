@@ -16,7 +16,7 @@ def test_acrpn_trains_a_robot(tmp_path):
     env = gym.make("FetchReachDense-v4")
     model = make(ACRPN, env, policy="MultiInputPolicy", n_steps=100, net_arch=[16])
     theta, log = model.actor.vector, TrainLog()
-    model.learn(150, log)
+    model.learn(250, log)
     assert len(log.rows) == 2
     assert log["step_rejected"] == [0, 0]
     assert not torch.equal(model.actor.vector, theta)
