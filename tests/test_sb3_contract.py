@@ -280,6 +280,15 @@ def test_hooks_and_timesteps(algorithm):
     assert sum(drift.total for drift in env.envs) == model.num_timesteps
 
 
+class StopAt(BaseCallback):
+    def __init__(self, step):
+        super().__init__()
+        self.step = step
+
+    def _on_step(self):
+        return self.num_timesteps < self.step
+
+
 @both
 @pytest.mark.parametrize(
     ("arguments", "simulated", "learnt_from"),
@@ -313,15 +322,6 @@ def test_stopped_while_the_length_of_episodes_is_found_out(algorithm):
     log = TrainLog()
     model.learn(1, log, reset_num_timesteps=False)
     assert log["n_episodes"] == [8]
-
-
-class StopAt(BaseCallback):
-    def __init__(self, step):
-        super().__init__()
-        self.step = step
-
-    def _on_step(self):
-        return self.num_timesteps < self.step
 
 
 @both

@@ -83,10 +83,12 @@ def fuse(optimizer: torch.optim.Optimizer) -> None:
 
     The same to rounding, and on small networks a fifth of a minibatch's time less.
     """
+    if not isinstance(optimizer, torch.optim.Adam):
+        return
     for group in optimizer.param_groups:
         devices = {parameter.device.type for parameter in group["params"]}
-        unset = group.get("fused") is None and group.get("foreach") is None
-        if isinstance(optimizer, torch.optim.Adam) and unset and devices <= {"cpu", "cuda"}:
+        unset = group["fused"] is None and group["foreach"] is None
+        if unset and devices <= {"cpu", "cuda"}:
             group["fused"] = True
 
 
