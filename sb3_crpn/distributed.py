@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import atexit
+import importlib
 import os
 import sys
 import tempfile
@@ -49,6 +50,9 @@ def init_from_env(timeout: timedelta = TIMEOUT) -> None:
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % n_gpus)
         if int(os.environ.get("LOCAL_WORLD_SIZE", "1")) <= n_gpus:
             backend = "cpu:gloo,cuda:nccl"
+    # Its functions' defaults are the group of the time of its import, which optimisers cause. If
+    # that kept this group, its threads would outlive _leave, and now and then abort the exit.
+    importlib.import_module("torch.distributed.nn.functional")
     dist.init_process_group(backend, timeout=timeout)
     atexit.register(_leave)
 

@@ -201,6 +201,8 @@ def on_both(folder):
     )
     model, _ = continued(folder, normalized())
     results["continued"] = tensors(model)
+    # the module that optimisers import and whose defaults would keep it
+    results["kept"] = torch.distributed.nn.functional.all_reduce.__defaults__[-1] is not None
     results["options"] = zoo_options(["--env", "Pendulum-v1"])
     results["seeded"] = zoo_options(["--seed", "3"])
     with pytest.raises(ValueError, match="-optimize is not allowed with torchrun"):
@@ -227,6 +229,10 @@ def two(tmp_path_factory):
     codes, (results, after_death) = run_ranks([on_both, killed], folder)
     assert codes == [0, -signal.SIGKILL]
     return folder, results, after_death
+
+
+def test_nothing_keeps_the_group_after_its_end(two):
+    assert not any(result["kept"] for result in two[1])
 
 
 def test_sums_and_broadcasts(two):
