@@ -2,9 +2,11 @@
 
     python -m benchmarks.learning --algos CRPN TRPO --envs CartPole-v1 Pendulum-v1 --seeds 10
     python -m benchmarks.learning --algos CRPN --defaults --set "" gamma=1 n_steps=1024,gamma=1
+    python -m benchmarks.learning --algos CRPN --defaults @benchmarks/learning/ablation/settings.txt
 
 A run that the results hold already is not repeated. Seeds come outermost and algorithms innermost,
-so that what is there so far is balanced. ``Random`` measures the random policy.
+so that what is there so far is balanced. ``Random`` measures the random policy; ``@FILE`` stands
+for arguments, one a line.
 """
 
 from __future__ import annotations
@@ -47,6 +49,7 @@ def _parse_arguments() -> argparse.Namespace:
         prog="python -m benchmarks.learning",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
+        fromfile_prefix_chars="@",
     )
     names = [*ALGORITHMS, RANDOM]
     parser.add_argument("--algos", nargs="+", default=names, choices=names, metavar="ALGO",

@@ -84,6 +84,18 @@ def test_malformed_setting_is_named(setting: str) -> None:
         parse_setting(setting)
 
 
+def test_ablation_is_of_its_file_of_settings() -> None:
+    folder = Path(store.__file__).parent / "ablation"
+    option, *settings = (folder / "settings.txt").read_text().splitlines()
+    assert option == "--set"
+    labels = {
+        ",".join(["defaults", *(f"{k}={v}" for k, v in sorted(parse_setting(setting).items()))])
+        for setting in settings
+    }
+    runs = store.read_runs(folder)
+    assert set(runs[(runs.env == "CartPole-v1") & (runs.algo == "CRPN")].setting) == labels
+
+
 def test_entry_is_exact_then_another_version_then_the_nearest_then_the_default() -> None:
     entries = dict.fromkeys(["A-v1", "A-v4", "AB-v9", "B-v0", "default"])
     assert find_entry(entries, "A-v1", {}) == "A-v1"
