@@ -50,8 +50,8 @@ def init_from_env(timeout: timedelta = TIMEOUT) -> None:
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % n_gpus)
         if int(os.environ.get("LOCAL_WORLD_SIZE", "1")) <= n_gpus:
             backend = "cpu:gloo,cuda:nccl"
-    # Its functions' defaults are the group of the time of its import, which optimisers cause. If
-    # that kept this group, its threads would outlive _leave, and now and then abort the exit.
+    # Optimisers import this module, whose functions' defaults are the group of that time: imported
+    # later it would keep this one, whose threads would outlive _leave and may abort the exit.
     importlib.import_module("torch.distributed.nn.functional")
     dist.init_process_group(backend, timeout=timeout)
     atexit.register(_leave)

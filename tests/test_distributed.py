@@ -201,7 +201,7 @@ def on_both(folder):
     )
     model, _ = continued(folder, normalized())
     results["continued"] = tensors(model)
-    # the module that optimisers import and whose defaults would keep it
+    # optimisers import this module, whose defaults are the group of that time
     results["kept"] = torch.distributed.nn.functional.all_reduce.__defaults__[-1] is not None
     results["options"] = zoo_options(["--env", "Pendulum-v1"])
     results["seeded"] = zoo_options(["--seed", "3"])

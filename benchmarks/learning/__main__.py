@@ -30,6 +30,7 @@ from benchmarks.learning.settings import (
     parse_setting,
     resolve,
     same_hyperparameters,
+    setting_label,
 )
 
 
@@ -77,13 +78,10 @@ def _wanted_runs(args: argparse.Namespace) -> Iterator[Run]:
     for seed, env, setting, algo in itertools.product(seeds, args.envs, args.settings, args.algos):
         overrides = parse_setting(setting)
         entry, arguments = resolve(algo, env, overrides, defaults=args.defaults)
-        label = [f"{key}={value}" for key, value in sorted(overrides.items())]
-        if args.defaults:
-            label.insert(0, "defaults")
         yield Run(
             algo=algo,
             env=env,
-            setting="" if algo == RANDOM else ",".join(label),
+            setting="" if algo == RANDOM else setting_label(overrides, defaults=args.defaults),
             timesteps=args.timesteps or BUDGETS[env],
             seed=seed,
             hyperparameters=describe(algo, arguments),

@@ -184,6 +184,12 @@ def parse_setting(setting: str) -> dict[str, Any]:
     return parsed
 
 
+def setting_label(overrides: Mapping[str, Any], *, defaults: bool = False) -> str:
+    """Return ``"key=value,..."``, in front ``"defaults"`` where they stand in for the entry."""
+    label = ["defaults"] if defaults else []
+    return ",".join([*label, *(f"{key}={value}" for key, value in sorted(overrides.items()))])
+
+
 def describe(algo: str, hyperparameters: Mapping[str, Any]) -> str:
     """Return ``"key=value; ..."`` of all hyperparameters, the constructor's defaults included.
 

@@ -21,6 +21,7 @@ from benchmarks.learning.settings import (
     parse_setting,
     resolve,
     same_hyperparameters,
+    setting_label,
 )
 from benchmarks.learning.statistics import (
     bootstrap,
@@ -88,10 +89,7 @@ def test_ablation_is_of_its_file_of_settings() -> None:
     folder = Path(store.__file__).parent / "ablation"
     option, *settings = (folder / "settings.txt").read_text().splitlines()
     assert option == "--set"
-    labels = {
-        ",".join(["defaults", *(f"{k}={v}" for k, v in sorted(parse_setting(setting).items()))])
-        for setting in settings
-    }
+    labels = {setting_label(parse_setting(setting), defaults=True) for setting in settings}
     runs = store.read_runs(folder)
     assert set(runs[(runs.env == "CartPole-v1") & (runs.algo == "CRPN")].setting) == labels
 
