@@ -252,3 +252,17 @@ def test_a_single_episode(algorithm):
     assert np.isnan(log["gradient_noise"]).all()
     assert set(log["hessian_shrinkage"]) == {0.0}
     assert all_finite(model)
+
+
+@both
+@SETTINGS
+@pytest.mark.parametrize(
+    ("log_std", "what"), [(-25.0, "(a product|the Hessian)"), (-40.0, "the gradient")]
+)
+def test_derivatives_that_overflow(algorithm, settings, log_std, what):
+    """Nor does the linear algebra's own error, which no tuner prunes, get out."""
+    model = make(algorithm, Drift(dim=1), policy_kwargs={"log_std_init": log_std}, **settings)
+    before = tensors(model)
+    with pytest.raises(ValueError, match=f"{what} is not finite.* raise alpha, or set target_kl"):
+        model.learn(60)
+    assert same(model, before)

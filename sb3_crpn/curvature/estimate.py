@@ -142,7 +142,13 @@ class EpisodeOperator:
         self._group_forms = group_forms
 
     def __matmul__(self, other: torch.Tensor) -> torch.Tensor:
-        """Return B v for v of shape [d], or B V for V of shape [d, n]; float64."""
+        """Return B v for v of shape [d], or B V for V of shape [d, n]; float64.
+
+        Raises
+        ------
+        ValueError
+            Wrong shape, or the product is not finite.
+        """
         other = torch.as_tensor(other, dtype=torch.float64)
         if other.shape[:1] != self.shape[:1] or other.ndim > 2:
             raise ValueError(
@@ -150,9 +156,9 @@ class EpisodeOperator:
                 f"or ({self.shape[1]}, n)"
             )
         if other.ndim == 1:
-            return all_sum(self.mean(self.group_products(other)))
+            return require_finite("a product", all_sum(self.mean(self.group_products(other))))
         columns = [self.mean(self.group_products(column)) for column in other.T]
-        return all_sum(torch.stack(columns, dim=1))
+        return require_finite("a product", all_sum(torch.stack(columns, dim=1)))
 
     def group_forms(self, basis: torch.Tensor) -> torch.Tensor:
         """Return this rank's parts of VᵀB_k V for V = ``basis``, [d, n] to [K, n, n]."""
@@ -221,6 +227,11 @@ def estimate_curvature(
     fisher_batch
         This rank's episodes of F; ``None``: the gradient's. Batches that are the same object, on
         every rank or on none, share their graphs.
+
+    Raises
+    ------
+    ValueError
+        The gradient is not finite, here, or a product with H or F, where it is asked for.
     """
     wanted = [
         gradient_batch,
@@ -238,7 +249,7 @@ def estimate_curvature(
     gradients = all_sum(of_gradient.means(EpisodeGroup.gradient, "n_episodes"))
     shares = (of_gradient.n_episodes / of_gradient.n_episodes.sum()).to(gradients.device)
     return CurvatureEstimate(
-        gradient=shares @ gradients,
+        gradient=require_finite("the gradient", shares @ gradients),
         hessian=EpisodeOperator(
             len(actor),
             lambda v: of_hessian.means(lambda group: group.hessian_product(v), "n_episodes"),
@@ -255,6 +266,17 @@ def estimate_curvature(
         gradient_noise=relative_noise(gradients, shares),
         gradient_batch=gradient_batch,
     )
+
+
+def require_finite(name: str, derivative: torch.Tensor) -> torch.Tensor:
+    """Return ``derivative``, summed over all ranks, or raise ValueError: it is not finite."""
+    if not derivative.isfinite().all():
+        raise ValueError(
+            f"{name} is not finite: log π(a|s), or a derivative of it, overflows at the policy's "
+            "parameters, as where the standard deviation of its actions has vanished. Training "
+            "gets there by steps that are too long: raise alpha, or set target_kl"
+        )
+    return derivative
 
 
 def relative_noise(groups: torch.Tensor, weights: torch.Tensor) -> float:

@@ -8,7 +8,12 @@ from dataclasses import dataclass
 import torch
 
 from sb3_crpn.cubic import krylov_basis
-from sb3_crpn.curvature.estimate import CurvatureEstimate, EpisodeOperator, relative_noise
+from sb3_crpn.curvature.estimate import (
+    CurvatureEstimate,
+    EpisodeOperator,
+    relative_noise,
+    require_finite,
+)
 from sb3_crpn.distributed import all_sum
 
 
@@ -87,11 +92,11 @@ def projected_model(
     basis, hessian_forms, fisher_form = _subspace(estimate, damping is not None, dim)
     # k × k matrices are slow work for a GPU
     gradient = (basis.T @ estimate.gradient).cpu()
-    hessians = all_sum(hessian_forms.cpu())  # [K, k, k]
+    hessians = require_finite("the Hessian", all_sum(hessian_forms.cpu()))  # [K, k, k]
     if damping is not None:
         # VᵀFV = QΛQᵀ and s = VQ(Λ + ε)^(-½) y make the M-norm of s the Euclidean norm of y;
         # F ⪰ 0, so that a negative eigenvalue is rounding
-        fisher = all_sum(fisher_form.cpu())
+        fisher = require_finite("the Fisher matrix", all_sum(fisher_form.cpu()))
         eigenvalues, vectors = torch.linalg.eigh(0.5 * (fisher + fisher.T))
         whiten = ((eigenvalues.clamp(min=0.0) + damping) ** -0.5)[:, None] * vectors.T
         basis = basis @ whiten.T.to(basis)
@@ -154,7 +159,7 @@ class _Recorder:
     def __call__(self, vector: torch.Tensor) -> torch.Tensor:
         products = self.operator.group_products(vector)
         self.columns.append(products)
-        return all_sum(self.operator.mean(products))
+        return require_finite("a product", all_sum(self.operator.mean(products)))
 
 
 def james_stein(hessians: torch.Tensor, weights: torch.Tensor) -> float:
