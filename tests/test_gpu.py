@@ -83,7 +83,7 @@ def test_frozen_episodes_give_what_they_give_on_the_cpu(kind):
     ],
 )
 def test_training_saving_and_loading(algorithm, arguments, tmp_path):
-    model = make(algorithm, Drift(dim=1), device="cuda", alpha=10.0, **arguments)
+    model = make(algorithm, Drift(dim=1), device="cuda", alpha=1e3, **arguments)
     log = TrainLog()
     model.learn(200, log)
     assert {p.device.type for p in model.policy.parameters()} == {"cuda"}

@@ -174,7 +174,8 @@ def test_the_same_seed_gives_the_same_certificate():
 
 
 def test_the_model_is_left_as_it_was():
-    model = PPO("MlpPolicy", VecNormalize(DummyVecEnv([lambda: gym.make("CartPole-v1")])), seed=0)
+    env = VecNormalize(DummyVecEnv([lambda: gym.make("CartPole-v1")]))
+    model = PPO("MlpPolicy", env, seed=0, device="cpu")
     before = [p.clone() for p in model.policy.parameters()]
     state, mean = torch.get_rng_state(), model.env.obs_rms.mean.copy()
     model.policy.set_training_mode(True)
