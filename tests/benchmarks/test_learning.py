@@ -85,13 +85,19 @@ def test_malformed_setting_is_named(setting: str) -> None:
         parse_setting(setting)
 
 
-def test_ablation_is_of_its_file_of_settings() -> None:
-    folder = Path(store.__file__).parent / "ablation"
+@pytest.mark.parametrize(
+    ("name", "defaults"), [("ablation", True), ("ablation_halfcheetah", False)]
+)
+def test_ablations_are_complete(name: str, defaults: bool) -> None:
+    folder = Path(store.__file__).parent / name
     option, *settings = (folder / "settings.txt").read_text().splitlines()
     assert option == "--set"
-    labels = {setting_label(parse_setting(setting), defaults=True) for setting in settings}
+    labels = {setting_label(parse_setting(setting), defaults=defaults) for setting in settings}
     runs = store.read_runs(folder)
-    assert set(runs[(runs.env == "CartPole-v1") & (runs.algo == "CRPN")].setting) == labels
+    runs = runs[runs.algo == "CRPN"]
+    assert set(runs.setting) == labels
+    assert set(runs.groupby(["env", "setting"]).size()) == {5}
+    assert len(runs) == 5 * len(labels) * runs.env.nunique()
 
 
 def test_entry_is_exact_then_another_version_then_the_nearest_then_the_default() -> None:
