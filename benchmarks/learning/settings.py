@@ -34,6 +34,7 @@ BUDGETS: dict[str, int] = {
     "Swimmer-v5": 300_000,
     "Hopper-v5": 300_000,
     "HalfCheetah-v5": 300_000,
+    "Walker2d-v5": 300_000,
     "FetchReachDense-v4": 100_000,
 }
 
