@@ -156,9 +156,11 @@ class EpisodeOperator:
                 f"or ({self.shape[1]}, n)"
             )
         if other.ndim == 1:
-            return require_finite("a product", all_sum(self.mean(self.group_products(other))))
-        columns = [self.mean(self.group_products(column)) for column in other.T]
-        return require_finite("a product", all_sum(torch.stack(columns, dim=1)))
+            product = self.mean(self.group_products(other))
+        else:
+            columns = [self.mean(self.group_products(column)) for column in other.T]
+            product = torch.stack(columns, dim=1)
+        return require_finite("a product", all_sum(product))
 
     def group_forms(self, basis: torch.Tensor) -> torch.Tensor:
         """Return this rank's parts of VᵀB_k V for V = ``basis``, [d, n] to [K, n, n]."""
@@ -269,7 +271,10 @@ def estimate_curvature(
 
 
 def require_finite(name: str, derivative: torch.Tensor) -> torch.Tensor:
-    """Return ``derivative``, summed over all ranks, or raise ValueError: it is not finite."""
+    """Return ``derivative``, or raise ValueError where an entry is NaN or infinite.
+
+    It is to be a sum over all ranks, so that all of them raise and none waits for another.
+    """
     if not derivative.isfinite().all():
         raise ValueError(
             f"{name} is not finite: log π(a|s), or a derivative of it, overflows at the policy's "
