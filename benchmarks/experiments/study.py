@@ -75,7 +75,8 @@ class Study:
         arguments = parser.parse_args()
         self._run(self._missing(self.jobs(arguments.seeds)), arguments.jobs)
         with plt.rc_context(STYLE):
-            figure = self.draw(pd.read_csv(self.csv, keep_default_na=False))
+            # a setting may be the empty text
+            figure = self.draw(pd.read_csv(self.csv, keep_default_na=False, na_values=["nan"]))
             figure.savefig(ROOT / "docs" / f"{self.name}.png", bbox_inches="tight")
 
     def _missing(self, jobs: list[Row]) -> list[Row]:

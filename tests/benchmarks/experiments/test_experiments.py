@@ -1,9 +1,10 @@
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
 from benchmarks.exact import lipschitz_constants, random_mdp
-from benchmarks.experiments import escape, sample_complexity, variance
+from benchmarks.experiments import cartpole, escape, sample_complexity, variance
 from benchmarks.experiments.learners import make_learner
 from benchmarks.experiments.sample_complexity import PROBLEMS, exact_updates
 from sb3_crpn.curvature import PairWeights
@@ -34,6 +35,32 @@ def test_an_escape_is_measured():
 def test_batches_are_those_of_the_recipe():
     (row,) = sample_complexity.measure("plateau", "REINFORCE", 0.4, 0)
     assert row["episodes"] == 50 * row["updates"] > 0
+
+
+@pytest.mark.parametrize("algorithm", ["CRPN", "ACRPN"])
+def test_updates_of_cartpole_are_recorded_with_what_they_learnt_from(algorithm):
+    rows = cartpole.measure(algorithm, "", seed=0, n_updates=3)
+    assert [row["update"] for row in rows] == [1, 2, 3]
+    # every environment's first episode, whose mean is an integer over the fifty
+    assert all((50 * row["mean_return"]) % 1 == pytest.approx(0) for row in rows)
+    assert 15 < rows[0]["mean_return"] < 35  # the uniform policy's is 22
+    assert all(row["kl_divergence"] > 0 for row in rows)
+
+
+def test_cartpole_is_solved_by_a_hundred_episodes_in_a_row():
+    returns = {0: [100.0, 500.0, 450.0, 450.0], 1: [480.0, 460.0, 490.0, 460.0]}
+    rows = pd.DataFrame(
+        [
+            {"algorithm": "CRPN", "change": "", "seed": seed, "update": k + 1, "mean_return": value}
+            | {"gradient_noise": 0.1, "negative_share": 0.2, "kl_divergence": 0.01}
+            for seed, values in returns.items()
+            for k, value in enumerate(values)
+        ]
+    )
+    last = cartpole.table(rows).splitlines()[-1].split("|")
+    assert [cell.strip() for cell in last[3:5]] == ["2 of 2", "3, 3"]
+    rows.loc[rows.seed == 0, "mean_return"] -= 5.0
+    assert "| 1 of 2 | 3 |" in cartpole.table(rows)
 
 
 @pytest.mark.parametrize("kind", ["fitted", "exact"])
