@@ -35,6 +35,7 @@ BUDGETS: dict[str, int] = {
     "Hopper-v5": 300_000,
     "HalfCheetah-v5": 300_000,
     "Walker2d-v5": 300_000,
+    "Ant-v5": 300_000,
     "FetchReachDense-v4": 100_000,
 }
 
