@@ -150,7 +150,7 @@ def table(rows: pd.DataFrame) -> str:
 
 def _pair_means(run: pd.DataFrame) -> NDArray[np.float64]:
     """Return the mean return over each two successive updates."""
-    returns: NDArray[np.float64] = run.sort_values("update").mean_return.to_numpy()
+    returns: NDArray[np.float64] = run.mean_return.to_numpy()
     return (returns[1:] + returns[:-1]) / 2
 
 
