@@ -27,7 +27,7 @@ import torch.distributed as dist
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_crpn import CRPN
-from sb3_crpn.distributed import all_max, alone, init_from_env, rank, world_size
+from sb3_crpn.distributed import all_max, init_from_env, local_mode, rank, world_size
 
 RESULTS = Path(__file__).with_suffix(".json")
 MODES = ("one process", "all ranks")
@@ -40,7 +40,7 @@ RANKS = (2, 8, 64, 512)
 
 def setting(mode: str) -> AbstractContextManager[None]:
     """Return the context in which there are the ranks of this mode."""
-    return alone() if mode == "one process" else nullcontext()
+    return local_mode() if mode == "one process" else nullcontext()
 
 
 def parts(model: CRPN, n_episodes: int) -> dict[str, Callable[[], object]]:

@@ -9,8 +9,8 @@ import torch
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_crpn.base import PolicyNewtonAlgorithm
-from sb3_crpn.base.arguments import check_real, check_schedule, inherits_arguments
+from sb3_crpn.algorithm import PolicyNewtonAlgorithm
+from sb3_crpn.algorithm.arguments import check_real, check_schedule, inherits_arguments
 from sb3_crpn.cubic import CubicStep
 from sb3_crpn.curvature import CurvatureEstimate, LocalModel
 
@@ -26,7 +26,7 @@ class REINFORCE(PolicyNewtonAlgorithm):
     actor_learning_rate
         η > 0, a float or a schedule. (``learning_rate`` is the critic's, as in CRPN.)
     **arguments
-        Those of :class:`~sb3_crpn.base.PolicyNewtonAlgorithm` but ``alpha``, ``target_kl``,
+        Those of :class:`~sb3_crpn.algorithm.PolicyNewtonAlgorithm` but ``alpha``, ``target_kl``,
         ``metric``, ``hessian_shrinkage`` and ``n_hessian_episodes``, which have no meaning here.
     """
 

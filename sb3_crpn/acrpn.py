@@ -10,8 +10,8 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_crpn.base import PolicyNewtonAlgorithm
-from sb3_crpn.base.arguments import (
+from sb3_crpn.algorithm import PolicyNewtonAlgorithm
+from sb3_crpn.algorithm.arguments import (
     check_flag,
     check_integer,
     check_optional,
@@ -43,7 +43,7 @@ class ACRPN(PolicyNewtonAlgorithm):
     stop_at_sosp
         End training when the predicted decrease says ε-SOSP, as the paper's Algorithm 2 does.
     **arguments
-        Those of :class:`~sb3_crpn.base.PolicyNewtonAlgorithm`.
+        Those of :class:`~sb3_crpn.algorithm.PolicyNewtonAlgorithm`.
     """
 
     @inherits_arguments(PolicyNewtonAlgorithm)

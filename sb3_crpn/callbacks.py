@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_crpn.base import PolicyNewtonAlgorithm
+from sb3_crpn.algorithm import PolicyNewtonAlgorithm
 
 
 class RandomIterateCallback(BaseCallback):

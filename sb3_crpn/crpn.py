@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from sb3_crpn.base import PolicyNewtonAlgorithm
-from sb3_crpn.base.arguments import check_choice, inherits_arguments
+from sb3_crpn.algorithm import PolicyNewtonAlgorithm
+from sb3_crpn.algorithm.arguments import check_choice, inherits_arguments
 from sb3_crpn.cubic import CubicStep, solve_dense, solve_krylov
 from sb3_crpn.curvature import LocalModel
 
@@ -24,7 +24,7 @@ class CRPN(PolicyNewtonAlgorithm):
         "dense": the whole Hessian, d products, by eigendecomposition; "krylov": products only;
         "auto": dense up to d = 64.
     **arguments
-        Those of :class:`~sb3_crpn.base.PolicyNewtonAlgorithm`.
+        Those of :class:`~sb3_crpn.algorithm.PolicyNewtonAlgorithm`.
     """
 
     @inherits_arguments(PolicyNewtonAlgorithm)

@@ -25,7 +25,7 @@ import torch.distributed as dist
 # whose process ends is noticed at once.
 TIMEOUT = timedelta(minutes=30)
 
-_alone = False
+_local_mode = False
 
 
 class RankError(RuntimeError):
@@ -73,18 +73,18 @@ def rank() -> int:
 
 
 def _grouped() -> bool:
-    return not _alone and dist.is_available() and dist.is_initialized()
+    return not _local_mode and dist.is_available() and dist.is_initialized()
 
 
 @contextmanager
-def alone() -> Iterator[None]:
+def local_mode() -> Iterator[None]:
     """Let the block be a run of one process, for what one rank does while the others wait."""
-    global _alone
-    outer, _alone = _alone, True
+    global _local_mode
+    outer, _local_mode = _local_mode, True
     try:
         yield
     finally:
-        _alone = outer
+        _local_mode = outer
 
 
 @contextmanager
@@ -167,7 +167,7 @@ def mean_and_variance(values: npt.NDArray[np.float64]) -> tuple[float, float]:
     return mean, all_sum(squares).item() / count
 
 
-def share(number: int) -> int:
+def local_count(number: int) -> int:
     """Return this rank's part of ``number`` things that are dealt out evenly."""
     return number // world_size() + (rank() < number % world_size())
 

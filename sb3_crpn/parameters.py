@@ -81,13 +81,13 @@ class ActorParameters:
             raise ValueError(
                 "vector has non-finite entries, must be finite in the parameters' precision"
             )
-        self.restore(tensors)
+        self.load(tensors)
 
     def snapshot(self) -> list[torch.Tensor]:
-        """Return copies of the tensors, for :meth:`restore`."""
+        """Return copies of the tensors, for :meth:`load`."""
         return [tensor.detach().clone() for tensor in self.tensors]
 
-    def restore(self, tensors: Sequence[torch.Tensor]) -> None:
+    def load(self, tensors: Sequence[torch.Tensor]) -> None:
         """Copy ``tensors`` back into the parameters, bit for bit."""
         with torch.no_grad():
             for parameter, tensor in zip(self.tensors, tensors, strict=True):

@@ -61,7 +61,7 @@ def frozen_episodes(policy, lengths=(3, 1, 4, 2), seed=0):
         observations=observations,
         actions=actions,
         lengths=np.array(lengths),
-        weights=rng.normal(size=n_steps),
+        cost_advantages=rng.normal(size=n_steps),
         values=rng.normal(size=n_steps),
         returns=rng.normal(size=n_steps),
         rewards=rng.normal(size=n_steps),
@@ -112,9 +112,9 @@ def pair_matrix(estimator, decay, weights):
 def dense_hessian(policy, actor, batch, estimator, decay):
     """(1/n) Σ_episodes [Σ_ij W_ij σ_i σ_jᵀ + Σ_i A_i ∇²log π_i], [d, d]."""
     sigma, curvature = scores(policy, actor, batch), log_hessians(policy, actor, batch)
-    total = torch.einsum("t,tij->ij", torch.from_numpy(batch.weights), curvature)
+    total = torch.einsum("t,tij->ij", torch.from_numpy(batch.cost_advantages), curvature)
     for steps in episode_slices(batch):
-        W = torch.from_numpy(pair_matrix(estimator, decay, batch.weights[steps]))
+        W = torch.from_numpy(pair_matrix(estimator, decay, batch.cost_advantages[steps]))
         total = total + sigma[steps].T @ W @ sigma[steps]
     return total / batch.n_episodes
 

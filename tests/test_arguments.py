@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sb3_crpn import ACRPN, CRPN, PAPER
-from sb3_crpn.base import PolicyNewtonAlgorithm
+from sb3_crpn.algorithm import PolicyNewtonAlgorithm
 from tests.envs import Drift
 from tests.training import both, make
 

@@ -13,7 +13,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_crpn import ACRPN, CRPN, PAPER
-from sb3_crpn.base import update
+from sb3_crpn.algorithm import update
 from sb3_crpn.cubic import solve_dense
 from tests.envs import Drift, Sampler
 from tests.oracle import paper_estimates

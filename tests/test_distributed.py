@@ -13,23 +13,23 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-import sb3_crpn.base.update
+import sb3_crpn.algorithm.update
 from sb3_crpn import ACRPN, CRPN
-from sb3_crpn.base.critic import fit_critic
-from sb3_crpn.base.trial import StepTester
+from sb3_crpn.algorithm.critic import fit_critic
+from sb3_crpn.algorithm.evaluation import CandidateEvaluator
 from sb3_crpn.cubic import solve_dense
 from sb3_crpn.curvature import PairWeights, estimate_curvature, full_model, projected_model
 from sb3_crpn.distributed import (
     RankError,
     all_max,
     all_sum,
-    alone,
     broadcast,
     gather_counts,
+    local_count,
+    local_mode,
     mean_and_variance,
     rank,
     rank_seed,
-    share,
     world_size,
     zoo_options,
 )
@@ -49,7 +49,7 @@ def test_one_process_is_left_alone(monkeypatch):
     assert all_sum(tensor) is tensor
     assert broadcast(tensor) is tensor
     assert all_max(2.0) == 2.0
-    assert share(7) == 7
+    assert local_count(7) == 7
     assert gather_counts(5) == [5]
     assert rank_seed(3) == 3
     values = np.random.default_rng(0).normal(5.0, 2.0, 1001)
@@ -64,12 +64,12 @@ def primitives():
     before = own.clone()
     reduced = all_sum(own), broadcast(own)
     assert torch.equal(own, before)
-    with alone():
+    with local_mode():
         assert all_sum(own) is own
         assert (world_size(), rank()) == (1, 0)
     moments = mean_and_variance(np.arange(10.0)[:3] if rank() else np.arange(10.0)[3:])
     seeds = rank_seed(7), rank_seed(7, 1)
-    numbers = all_max(float(rank())), gather_counts(5 + rank()), share(7)
+    numbers = all_max(float(rank())), gather_counts(5 + rank()), local_count(7)
     return own, *reduced, numbers, moments, seeds
 
 
@@ -93,13 +93,13 @@ def measured(n_of_rank_0, max_steps=None):
         "gradient of few": other.gradient,
         "fisher of few": other.fisher @ v,
     }
-    tester = StepTester(policy, actor, batch, max_steps)
+    tester = CandidateEvaluator(policy, actor, batch, max_steps)
     for name, model in {
         "fisher": projected_model(estimate, damping=0.1, dim=5, shrinkage=None),
         "newton": projected_model(estimate, damping=None, dim=None, shrinkage=None),
     }.items():
-        step = model.lift(solve_dense(model.gradient, model.hessian, 10.0).step)
-        trial = tester.try_step(step)
+        step = model.to_parameters(solve_dense(model.gradient, model.hessian, 10.0).step)
+        trial = tester.evaluate(step)
         results[f"{name} step"] = step
         results[f"{name} trial"] = torch.tensor([trial.kl, trial.surrogate_change])
         results[f"{name} shrinkage"] = torch.tensor(model.shrinkage)
@@ -136,7 +136,7 @@ class Watch:
     """Keeps what a rank's running moments are updated with, and the policy after updates."""
 
     def __init__(self, monkeypatch, env):
-        update, give = RunningMeanStd.update, sb3_crpn.base.update.broadcast_state
+        update, give = RunningMeanStd.update, sb3_crpn.algorithm.update.broadcast_state
         self.seen, self.states = defaultdict(list), []
 
         def recorded(moments, array):
@@ -151,7 +151,7 @@ class Watch:
             give(policy)
 
         monkeypatch.setattr(RunningMeanStd, "update", recorded)
-        monkeypatch.setattr(sb3_crpn.base.update, "broadcast_state", compared)
+        monkeypatch.setattr(sb3_crpn.algorithm.update, "broadcast_state", compared)
 
 
 def trained(folder, algorithm, n_updates, **arguments):

@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_crpn import ACRPN, PAPER
-from sb3_crpn.base import collection
+from sb3_crpn.algorithm import collection
 from tests.envs import Drift, Faulty, FaultyReset, Rewards, Sampler
 from tests.training import TrainLog, all_finite, both, make, same, several, tensors
 

@@ -9,8 +9,8 @@ import torch
 import torch.distributed as dist
 
 from sb3_crpn import CRPN, distributed
-from sb3_crpn.base.critic import fit_critic
-from sb3_crpn.base.trial import StepTester
+from sb3_crpn.algorithm.critic import fit_critic
+from sb3_crpn.algorithm.evaluation import CandidateEvaluator
 from sb3_crpn.cubic import solve_krylov
 from sb3_crpn.curvature import PairWeights, estimate_curvature, full_model, projected_model
 from sb3_crpn.parameters import ActorParameters
@@ -52,11 +52,12 @@ def measured(kind, device):
             full_model(estimate, 1.0),
         ]
         steps = [
-            model.lift(solve_krylov(model.gradient, model.product, 10.0).step) for model in models
+            model.to_parameters(solve_krylov(model.gradient, model.product, 10.0).step)
+            for model in models
         ]
-        tester = StepTester(policy, actor, batch, max_steps)
+        tester = CandidateEvaluator(policy, actor, batch, max_steps)
         for number, step in enumerate(steps):
-            trial = tester.try_step(step)
+            trial = tester.evaluate(step)
             effect = torch.tensor([trial.kl, trial.surrogate_change])
             results |= {f"step {number} {max_steps}": step, f"trial {number} {max_steps}": effect}
         tester.restore()

@@ -134,7 +134,7 @@ def test_snapshots_are_restored_bitwise():
     vector, tensors = actor.vector, actor.snapshot()
     actor.assign(vector * 1.1 + 0.1)
     assert not torch.equal(actor.vector, vector)
-    actor.restore(tensors)
+    actor.load(tensors)
     assert torch.equal(actor.vector, vector)
     assert all(p.requires_grad for p in actor.tensors)
 

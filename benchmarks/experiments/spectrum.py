@@ -36,10 +36,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from benchmarks.experiments.study import PALETTE, Row, Study
 from sb3_crpn import CRPN
 from sb3_crpn.curvature import PairWeights
-from sb3_crpn.curvature.scores import EpisodeGroup
+from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.episodes.batch import episode_starts
-from sb3_crpn.sosp.episodes import collect_episodes, undisturbed, with_baseline
+from sb3_crpn.sosp.episodes import collect_episodes, preserve_state, with_baseline
 from sb3_crpn.sosp.spectrum import Spectrum, lanczos_spectrum
 
 Operator = Callable[[torch.Tensor], torch.Tensor]
@@ -104,9 +104,9 @@ class _Checkpoints(BaseCallback):
     def _examine(self) -> list[Row]:
         model, seed = self.model, int(self._rng.integers(2**31))
         assert isinstance(model, CRPN)
-        with undisturbed(model.policy, self._env, seed):
+        with preserve_state(model.policy, self._env, seed):
             batch = collect_episodes(model.policy, self._env, self._n_episodes, gamma=model.gamma)
-            value = -float(batch.weights[episode_starts(batch.lengths)].mean())
+            value = -float(batch.cost_advantages[episode_starts(batch.lengths)].mean())
             batch = with_baseline(model.policy, batch, model.gamma)
             own = model.estimate_curvature(self._n_episodes, self._env).gradient_batch
             halves = {
@@ -124,7 +124,7 @@ def _halves(model: CRPN, batch: EpisodeBatch, kappa: float) -> list[Operator]:
     """Return the products with the Hessians of either half of the episodes."""
     weights = PairWeights("causal", kappa)
     return [
-        EpisodeGroup(model.policy, model.actor, part, weights).hessian_product
+        EpisodeDerivatives(model.policy, model.actor, part, weights).hessian_product
         for part in batch.split(2)
     ]
 

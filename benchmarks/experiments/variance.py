@@ -30,7 +30,7 @@ from benchmarks.experiments.learners import make_learner
 from benchmarks.experiments.study import PALETTE, Row, Study, interval
 from sb3_crpn import CRPN
 from sb3_crpn.curvature import PairWeights
-from sb3_crpn.curvature.scores import EpisodeGroup
+from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.episodes.batch import episode_time
 
@@ -92,7 +92,7 @@ def measure(horizon: int, seed: int) -> list[Row]:
 def _mean_returns(mdp: TabularMDP, batch: EpisodeBatch) -> NDArray[np.float64]:
     """Return the mean return-to-go from each state, [S]."""
     states = _states(batch)
-    returns = -batch.weights / mdp.gamma ** episode_time(batch.lengths)
+    returns = -batch.cost_advantages / mdp.gamma ** episode_time(batch.lengths)
     visits = np.bincount(states, minlength=len(mdp.initial))
     return np.bincount(states, returns, minlength=len(mdp.initial)) / np.maximum(visits, 1)
 
@@ -103,7 +103,7 @@ def _less_baseline(
     """Return the batch with the weights Ψ_i + γ^i V_i(s_i), ``values`` [H, S]."""
     time = episode_time(batch.lengths)
     baseline = mdp.gamma**time * values[time, _states(batch)]
-    return replace(batch, weights=batch.weights + baseline)
+    return replace(batch, cost_advantages=batch.cost_advantages + baseline)
 
 
 def _states(batch: EpisodeBatch) -> NDArray[np.int64]:
@@ -113,7 +113,7 @@ def _states(batch: EpisodeBatch) -> NDArray[np.int64]:
 
 def _hessian(model: CRPN, batch: EpisodeBatch, weights: PairWeights) -> torch.Tensor:
     """Return the estimate of ∇²J from one batch, [d, d]."""
-    group = EpisodeGroup(model.policy, model.actor, batch, weights)
+    group = EpisodeDerivatives(model.policy, model.actor, batch, weights)
     identity = torch.eye(len(model.actor), dtype=torch.float64)
     return torch.stack([group.hessian_product(unit) for unit in identity])
 

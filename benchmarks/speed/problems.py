@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_crpn.base import PolicyNewtonAlgorithm
+from sb3_crpn.algorithm import PolicyNewtonAlgorithm
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.vec_env import GymnasiumVecEnv
 

@@ -10,7 +10,7 @@ import torch
 from benchmarks.speed.problems import SHAPES, collect, noise_model
 from benchmarks.speed.timing import Row, Task, compare
 from sb3_crpn import CRPN
-from sb3_crpn.base import PolicyNewtonAlgorithm
+from sb3_crpn.algorithm import PolicyNewtonAlgorithm
 from sb3_crpn.episodes import EpisodeBatch
 
 
@@ -42,8 +42,12 @@ def product_tasks(model: PolicyNewtonAlgorithm, batch: EpisodeBatch) -> dict[str
 def gradient_of(model: PolicyNewtonAlgorithm, batch: EpisodeBatch) -> Callable[[], None]:
     """Return the computation of Σ_i A_i σ_i by plain automatic differentiation."""
     pieces = [
-        (piece.observations, piece.actions, torch.as_tensor(piece.weights, dtype=torch.float32))
-        for piece in batch.pieces(model.max_batch_timesteps)
+        (
+            piece.observations,
+            piece.actions,
+            torch.as_tensor(piece.cost_advantages, dtype=torch.float32),
+        )
+        for piece in batch.chunks(model.max_batch_timesteps)
     ]
 
     def run() -> None:

@@ -17,8 +17,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from benchmarks.speed.problems import noise
 from benchmarks.speed.timing import Row, Task, compare
 from sb3_crpn import ACRPN, CRPN
-from sb3_crpn.base import PolicyNewtonAlgorithm
-from sb3_crpn.episodes import EarlierRollouts
+from sb3_crpn.algorithm import PolicyNewtonAlgorithm
+from sb3_crpn.episodes import Replay
 
 # Rollouts trained on before the one that is timed: α, Adam and any earlier rollouts are then as
 # they are in the middle of training
@@ -27,7 +27,7 @@ WARM_UP_ROLLOUTS = 3
 SETTINGS: dict[str, dict[str, Any]] = {"one rollout": {"n_reused_rollouts": 0}, "defaults": {}}
 
 # What training changes besides networks and optimiser
-_MUTABLE = (bool, int, float, type(None), EarlierRollouts)
+_MUTABLE = (bool, int, float, type(None), Replay)
 
 
 def measure(repeats: int = 20, n_steps: int = 2048, n_envs: int = 2) -> list[Row]:

@@ -10,9 +10,9 @@ from typing import Literal
 import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_crpn.curvature.scores import EpisodeGroup, PairWeights
+from sb3_crpn.curvature.derivatives import EpisodeDerivatives, PairWeights
 from sb3_crpn.distributed import all_sum, gather_counts, rank
-from sb3_crpn.episodes.batch import EpisodeBatch, IntArray, deal, episode_runs
+from sb3_crpn.episodes.batch import EpisodeBatch, IntArray, episode_chunks, round_robin_split
 from sb3_crpn.parameters import ActorParameters
 
 # Groups whose disagreement measures the noise: two give an unbiased estimate of it, and more of
@@ -22,13 +22,13 @@ N_GROUPS = 2
 # Steps of one graph on a CPU: enough to be efficient, few enough for its cache. With 100,000 steps
 # a Hessian product took 0.93 times as long as in two graphs, a Fisher product 0.85 times. A GPU
 # waits for its kernels to be launched, and gets one graph a group.
-CPU_RUN_STEPS = 4096
+CPU_CHUNK_STEPS = 4096
 
 # VᵀBV of more columns is made from products, whose memory does not grow with columns × timesteps
 MAX_FORM_COLUMNS = 128
 
 
-class NoiseGroups:
+class EpisodeFolds:
     """The episodes of all ranks, dealt in turn to K groups, of which this rank holds a part.
 
     K = 2, or 1 where there is only one episode.
@@ -36,9 +36,9 @@ class NoiseGroups:
     Parameters
     ----------
     policy, actor, batch, pair_weights
-        As :class:`EpisodeGroup` takes them; ``batch`` holds this rank's episodes, possibly none.
+        As for :class:`EpisodeDerivatives`; ``batch`` holds this rank's episodes, possibly none.
     max_steps
-        The groups are sums over runs of episodes, on a CPU of at most ``CPU_RUN_STEPS`` steps.
+        The groups are sums over runs of episodes, on a CPU of at most ``CPU_CHUNK_STEPS`` steps.
         ``None``: the runs' graphs are kept for every product. Otherwise they live for one product
         and hold at most so many steps.
 
@@ -57,28 +57,30 @@ class NoiseGroups:
         max_steps: int | None,
     ) -> None:
         counts = gather_counts(batch.n_episodes)
-        dealt = deal(batch.n_episodes, min(N_GROUPS, sum(counts)), first=sum(counts[: rank()]))
+        dealt = round_robin_split(
+            batch.n_episodes, min(N_GROUPS, sum(counts)), first=sum(counts[: rank()])
+        )
         own = [[len(episodes), batch.lengths[episodes].sum()] for episodes in dealt]
         self.n_episodes, self.n_steps = all_sum(torch.tensor(own, dtype=torch.float64)).T
         self._zero = torch.zeros(len(actor), dtype=torch.float64, device=actor.device)
 
-        def run(episodes: IntArray) -> Callable[[], EpisodeGroup]:
-            def open_run() -> EpisodeGroup:
-                return EpisodeGroup(policy, actor, batch.take(episodes), pair_weights)
+        def run(episodes: IntArray) -> Callable[[], EpisodeDerivatives]:
+            def open_run() -> EpisodeDerivatives:
+                return EpisodeDerivatives(policy, actor, batch.take(episodes), pair_weights)
 
             return cache(open_run) if max_steps is None else open_run
 
         limit = batch.n_steps if max_steps is None else max_steps
         if actor.device.type == "cpu":
-            limit = min(limit, CPU_RUN_STEPS)
+            limit = min(limit, CPU_CHUNK_STEPS)
         self._groups = [
-            [run(episodes[part]) for part in episode_runs(batch.lengths[episodes], limit)]
+            [run(episodes[part]) for part in episode_chunks(batch.lengths[episodes], limit)]
             for episodes in dealt
         ]
 
     def means(
         self,
-        quantity: Callable[[EpisodeGroup], torch.Tensor],
+        quantity: Callable[[EpisodeDerivatives], torch.Tensor],
         unit: Literal["n_episodes", "n_steps"],
         shape: tuple[int, ...] | None = None,
     ) -> torch.Tensor:
@@ -97,8 +99,8 @@ class NoiseGroups:
 
     def _mean(
         self,
-        runs: list[Callable[[], EpisodeGroup]],
-        quantity: Callable[[EpisodeGroup], torch.Tensor],
+        runs: list[Callable[[], EpisodeDerivatives]],
+        quantity: Callable[[EpisodeDerivatives], torch.Tensor],
         unit: str,
         size: float,
         total: torch.Tensor,
@@ -109,7 +111,7 @@ class NoiseGroups:
         return total
 
 
-class EpisodeOperator:
+class GroupedOperator:
     """A symmetric d × d matrix B = Σ_k w_k B_k, known through its products B_k v.
 
     k runs over groups of whole episodes; Σ w_k = 1. ``operator @ v`` costs one product with each
@@ -199,8 +201,8 @@ class CurvatureEstimate:
     """
 
     gradient: torch.Tensor
-    hessian: EpisodeOperator
-    fisher: EpisodeOperator
+    hessian: GroupedOperator
+    fisher: GroupedOperator
     gradient_noise: float
     gradient_batch: EpisodeBatch
 
@@ -244,23 +246,23 @@ def estimate_curvature(
     if max_steps is not None and sum(batch.n_steps for batch in batches.values()) <= max_steps:
         max_steps = None
     groups = {
-        key: NoiseGroups(policy, actor, batch, pair_weights, max_steps)
+        key: EpisodeFolds(policy, actor, batch, pair_weights, max_steps)
         for key, batch in batches.items()
     }
     of_gradient, of_hessian, of_fisher = (groups[id(batch)] for batch in wanted)
-    gradients = all_sum(of_gradient.means(EpisodeGroup.gradient, "n_episodes"))
+    gradients = all_sum(of_gradient.means(EpisodeDerivatives.gradient, "n_episodes"))
     shares = (of_gradient.n_episodes / of_gradient.n_episodes.sum()).to(gradients.device)
     return CurvatureEstimate(
         gradient=require_finite("the gradient", shares @ gradients),
-        hessian=EpisodeOperator(
+        hessian=GroupedOperator(
             len(actor),
             lambda v: of_hessian.means(lambda group: group.hessian_product(v), "n_episodes"),
             of_hessian.n_episodes,
             lambda V: of_hessian.means(
-                lambda group: group.hessian_form(V), "n_episodes", (V.shape[1], V.shape[1])
+                lambda group: group.quadratic_form(V), "n_episodes", (V.shape[1], V.shape[1])
             ),
         ),
-        fisher=EpisodeOperator(
+        fisher=GroupedOperator(
             len(actor),
             lambda v: of_fisher.means(lambda group: group.fisher_product(v), "n_steps"),
             of_fisher.n_steps,

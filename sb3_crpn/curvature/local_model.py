@@ -10,7 +10,7 @@ import torch
 from sb3_crpn.cubic import krylov_basis
 from sb3_crpn.curvature.estimate import (
     CurvatureEstimate,
-    EpisodeOperator,
+    GroupedOperator,
     relative_noise,
     require_finite,
 )
@@ -47,7 +47,7 @@ class LocalModel:
     lambda_min: float
     products: int
 
-    def lift(self, coordinates: torch.Tensor) -> torch.Tensor:
+    def to_parameters(self, coordinates: torch.Tensor) -> torch.Tensor:
         """Return the step s = basis · y, [d]."""
         return coordinates if self.basis is None else self.basis @ coordinates.to(self.basis)
 
@@ -152,7 +152,7 @@ def _start(gradient: torch.Tensor) -> torch.Tensor:
 class _Recorder:
     """v ↦ Bv, keeping the groups' B_k v of every call."""
 
-    def __init__(self, operator: EpisodeOperator) -> None:
+    def __init__(self, operator: GroupedOperator) -> None:
         self.operator = operator
         self.columns: list[torch.Tensor] = []
 

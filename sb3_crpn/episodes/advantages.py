@@ -64,7 +64,7 @@ def generalized_advantages(
     return advantages
 
 
-def cost_weights(
+def cost_advantages(
     advantages: FloatArray,
     lengths: IntArray,
     *,

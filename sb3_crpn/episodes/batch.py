@@ -11,6 +11,15 @@ import numpy.typing as npt
 import torch
 from scipy.signal import lfilter
 
+from sb3_crpn.distributed import (
+    all_max,
+    all_sum,
+    broadcast,
+    gather_counts,
+    mean_and_variance,
+    rank,
+)
+
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 Observations: TypeAlias = torch.Tensor | dict[str, torch.Tensor]
@@ -27,7 +36,7 @@ def episode_time(lengths: IntArray) -> IntArray:
     return time
 
 
-def episode_runs(lengths: IntArray, max_steps: int) -> list[slice]:
+def episode_chunks(lengths: IntArray, max_steps: int) -> list[slice]:
     """Cut episodes laid end to end into runs of at most ``max_steps`` steps, or of one episode."""
     ends = np.cumsum(lengths)
     runs, start = [], 0
@@ -39,7 +48,7 @@ def episode_runs(lengths: IntArray, max_steps: int) -> list[slice]:
     return runs
 
 
-def deal(n_episodes: int, n_groups: int, first: int = 0) -> list[IntArray]:
+def round_robin_split(n_episodes: int, n_groups: int, first: int = 0) -> list[IntArray]:
     """Deal episodes in turn to the groups, beginning with group ``first`` mod ``n_groups``.
 
     The episodes are independent and identically distributed, so any split that does not look at
@@ -89,13 +98,16 @@ def episode_scan(
 class EpisodeBatch:
     """E whole episodes of T steps in all, laid end to end.
 
+    With several ranks a batch is the union of what they hold, and each sees its own part. What is
+    to be known of the union goes through this class: all ranks must then ask for it.
+
     Attributes
     ----------
     observations, actions
         Tensors of first dimension T (one per key for dict observations), as the policy takes them.
     lengths
         Steps of each episode, [E].
-    weights
+    cost_advantages
         A_i of DESIGN section 2, [T]: the cost-to-go, less a baseline; positive is bad.
     values, returns
         The critic's V(s_i) and its regression target, the λ-return, [T].
@@ -110,7 +122,7 @@ class EpisodeBatch:
     observations: Observations
     actions: torch.Tensor
     lengths: IntArray
-    weights: FloatArray
+    cost_advantages: FloatArray
     values: FloatArray
     returns: FloatArray
     rewards: FloatArray
@@ -125,7 +137,38 @@ class EpisodeBatch:
     @property
     def n_steps(self) -> int:
         """T, the number of steps."""
-        return len(self.weights)
+        return len(self.cost_advantages)
+
+    @property
+    def total_episodes(self) -> int:
+        """The number of episodes that all ranks hold; every rank must ask."""
+        return sum(gather_counts(self.n_episodes))
+
+    @property
+    def total_steps(self) -> int:
+        """The number of steps that all ranks hold; every rank must ask."""
+        return sum(gather_counts(self.n_steps))
+
+    @property
+    def preceding_episodes(self) -> int:
+        """The number of episodes on the ranks before this one; every rank must ask."""
+        return sum(gather_counts(self.n_episodes)[: rank()])
+
+    def total(self, part: torch.Tensor) -> torch.Tensor:
+        """Return the sum of a quantity whose ``part`` this rank's episodes make up."""
+        return all_sum(part)
+
+    def largest(self, value: float) -> float:
+        """Return the largest of the ranks' values."""
+        return all_max(value)
+
+    def agreed(self, tensor: torch.Tensor) -> torch.Tensor:
+        """Return the ``tensor`` of rank 0."""
+        return broadcast(tensor)
+
+    def moments(self, values: FloatArray) -> tuple[float, float]:
+        """Return mean and variance over the steps of all ranks of ``values``, [T]."""
+        return mean_and_variance(values)
 
     def take(self, episodes: IntArray) -> EpisodeBatch:
         """Return the batch of the chosen episodes, in the order given."""
@@ -138,16 +181,16 @@ class EpisodeBatch:
         n_groups = min(n_groups, self.n_episodes)
         if n_groups == 1:
             return [self]
-        return [self.take(episodes) for episodes in deal(self.n_episodes, n_groups)]
+        return [self.take(episodes) for episodes in round_robin_split(self.n_episodes, n_groups)]
 
-    def pieces(self, max_steps: int | None) -> list[EpisodeBatch]:
-        """Cut the batch, as :func:`episode_runs` does, into batches that share its memory."""
+    def chunks(self, max_steps: int | None) -> list[EpisodeBatch]:
+        """Cut the batch, as :func:`episode_chunks` does, into batches that share its memory."""
         if max_steps is None or self.n_steps <= max_steps:
             return [self] if self.n_episodes else []
         ends = np.append(0, np.cumsum(self.lengths))
         return [
             self._select(episodes, slice(ends[episodes.start], ends[episodes.stop]))
-            for episodes in episode_runs(self.lengths, max_steps)
+            for episodes in episode_chunks(self.lengths, max_steps)
         ]
 
     def _select(self, episodes: slice | IntArray, steps: slice | IntArray) -> EpisodeBatch:
@@ -155,7 +198,7 @@ class EpisodeBatch:
             observations=map_observations(self.observations, lambda tensor: tensor[steps]),
             actions=self.actions[steps],
             lengths=self.lengths[episodes],
-            weights=self.weights[steps],
+            cost_advantages=self.cost_advantages[steps],
             values=self.values[steps],
             returns=self.returns[steps],
             rewards=self.rewards[steps],

@@ -14,9 +14,9 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import DictRolloutBufferSamples, RolloutBufferSamples
 
 from sb3_crpn.distributed import all_sum
-from sb3_crpn.episodes.advantages import cost_weights, generalized_advantages
+from sb3_crpn.episodes.advantages import cost_advantages, generalized_advantages
 from sb3_crpn.episodes.batch import EpisodeBatch, IntArray, Observations, episode_time
-from sb3_crpn.episodes.quota import EpisodeEnd
+from sb3_crpn.episodes.tracker import EpisodeEnd
 
 # Steps in one forward pass that evaluates: enough to be efficient, of bounded memory
 CHUNK = 4096
@@ -116,13 +116,13 @@ class EpisodeRolloutBuffer(RolloutBuffer):
     def episode_batch(
         self, *, baseline: bool, normalize_advantage: bool, discount_visitation: bool
     ) -> EpisodeBatch:
-        """Return the kept episodes with the weights of :func:`cost_weights`.
+        """Return the kept episodes with the weights of :func:`cost_advantages`.
 
         Â is the advantage, or the λ-return where ``baseline`` is false.
         """
         kept = self._kept_steps()
         lengths = self.lengths
-        weights = cost_weights(
+        weights = cost_advantages(
             (self.advantages if baseline else self.returns)[kept].astype(np.float64),
             lengths,
             gamma=self.gamma,
@@ -133,7 +133,7 @@ class EpisodeRolloutBuffer(RolloutBuffer):
             observations=self._gather_observations(kept),
             actions=self._gather_actions(kept),
             lengths=lengths,
-            weights=weights,
+            cost_advantages=weights,
             values=self.values[kept].astype(np.float64),
             returns=self.returns[kept].astype(np.float64),
             rewards=self.rewards[kept].astype(np.float64),

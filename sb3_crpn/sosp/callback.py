@@ -10,7 +10,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import sync_envs_normalization
 
-from sb3_crpn.base.arguments import check_flag, check_integer
+from sb3_crpn.algorithm.arguments import check_flag, check_integer
 from sb3_crpn.sosp.certificate import certify_sosp
 from sb3_crpn.sosp.report import SospReport
 

@@ -14,12 +14,12 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_crpn.base import PolicyNewtonAlgorithm
-from sb3_crpn.base.arguments import check_choice, check_integer, check_optional, check_real
+from sb3_crpn.algorithm import PolicyNewtonAlgorithm
+from sb3_crpn.algorithm.arguments import check_choice, check_integer, check_optional, check_real
 from sb3_crpn.episodes.batch import EpisodeBatch, map_observations
 from sb3_crpn.parameters import ActorParameters
-from sb3_crpn.sosp.blocks import BlockSample
-from sb3_crpn.sosp.episodes import collect_episodes, undisturbed, with_baseline
+from sb3_crpn.sosp.batch_means import BatchMeans
+from sb3_crpn.sosp.episodes import collect_episodes, preserve_state, with_baseline
 from sb3_crpn.sosp.inference import bernstein_intervals, bootstrap_intervals
 from sb3_crpn.sosp.report import IntervalMethod, SospReport
 from sb3_crpn.sosp.spectrum import lanczos_spectrum
@@ -106,12 +106,12 @@ def certify_sosp(
     policy, target = _policy(model), _environment(model, env)
     rng = np.random.default_rng(seed)
     n_blocks, n_episodes = _blocks(n_episodes)
-    with undisturbed(policy, target, int(rng.integers(2**31))):
+    with preserve_state(policy, target, int(rng.integers(2**31))):
         horizon = getattr(model, "horizon", None)
         batch = collect_episodes(policy, target, n_episodes, gamma=model.gamma, horizon=horizon)
         if interval == "bootstrap":
             batch = with_baseline(policy, batch, model.gamma)
-        sample = BlockSample.from_episodes(
+        sample = BatchMeans.from_episodes(
             policy, _actor(policy, batch), batch, n_blocks, model.gamma, rng
         )
         generator = torch.Generator().manual_seed(int(rng.integers(2**31)))

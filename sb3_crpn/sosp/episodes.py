@@ -14,7 +14,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_crpn.base.collection import ENDLESS, Array
+from sb3_crpn.algorithm.collection import ENDLESS, Array
 from sb3_crpn.episodes import (
     DictEpisodeRolloutBuffer,
     EpisodeBatch,
@@ -26,7 +26,7 @@ from sb3_crpn.episodes.batch import episode_time
 
 
 @contextmanager
-def undisturbed(policy: ActorCriticPolicy, env: VecEnv, seed: int) -> Iterator[None]:
+def preserve_state(policy: ActorCriticPolicy, env: VecEnv, seed: int) -> Iterator[None]:
     """Put ``policy`` in evaluation mode on a random stream of its own, then undo all of it.
 
     Kept are the mode, the action distribution (SB3's policies reuse one object; with gSDE it holds
@@ -97,7 +97,7 @@ def collect_episodes(
             buffer.close_episode(end, terminal_value=0.0)
             last_end = buffer.pos
         obs, starts = new_obs, dones
-        if tracker.stalled:
+        if tracker.needs_reset:
             obs, starts = env.reset(), np.ones(env.num_envs, dtype=bool)
             tracker.restart()
         if buffer.pos - last_end >= ENDLESS:
@@ -109,7 +109,7 @@ def collect_episodes(
     batch = buffer.episode_batch(
         baseline=False, normalize_advantage=False, discount_visitation=True
     )
-    if not np.isfinite(batch.weights).all():
+    if not np.isfinite(batch.cost_advantages).all():
         raise ValueError("the environment returned a non-finite reward; VecCheckNan finds it")
     return batch
 
@@ -122,7 +122,9 @@ def with_baseline(policy: ActorCriticPolicy, batch: EpisodeBatch, gamma: float) 
     """
     with torch.no_grad():
         values = policy.predict_values(batch.observations).flatten().cpu().double().numpy()
-    return replace(batch, weights=batch.weights + gamma ** episode_time(batch.lengths) * values)
+    return replace(
+        batch, cost_advantages=batch.cost_advantages + gamma ** episode_time(batch.lengths) * values
+    )
 
 
 def _new_buffer(policy: ActorCriticPolicy, n_envs: int, gamma: float) -> EpisodeRolloutBuffer:

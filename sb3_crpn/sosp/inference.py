@@ -20,7 +20,7 @@ Each interval has one limit on that side and one on the other.
 Actions that a policy seldom takes may be missing from all episodes, which then agree, on wrong
 values: a policy near to a deterministic one would look stationary. But their probabilities are
 known. The spread of g_k is therefore taken to be no smaller than these imply
-(:func:`~sb3_crpn.sosp.implied.implied_covariance`); that of H_k is increased by the same factor,
+(:func:`~sb3_crpn.sosp.model_covariance.model_covariance`); that of H_k grows by the same factor,
 and beyond a factor of 2 λ_min is given no limits.
 
 The two-sided interval of "bernstein" is a ball around the estimate instead.
@@ -35,9 +35,9 @@ import numpy as np
 import torch
 from scipy.stats import t as student
 
-from sb3_crpn.sosp.blocks import BlockSample
+from sb3_crpn.sosp.batch_means import BatchMeans
+from sb3_crpn.sosp.robust import worst_curvature
 from sb3_crpn.sosp.spectrum import FloatArray, Spectrum, lanczos_spectrum
-from sb3_crpn.sosp.worst import worst_curvature
 
 N_RESAMPLES = 10_000
 
@@ -64,7 +64,7 @@ class Interval:
 
 
 def bootstrap_intervals(
-    sample: BlockSample,
+    sample: BatchMeans,
     spectrum: Spectrum,
     confidence: float,
     generator: torch.Generator,
@@ -101,7 +101,7 @@ def bootstrap_intervals(
 
 
 def bernstein_intervals(
-    sample: BlockSample,
+    sample: BatchMeans,
     spectrum: Spectrum,
     confidence: float,
     bounds: tuple[float, float],
@@ -135,10 +135,10 @@ def bernstein_radius(bound: float, n: int, dimensions: int, error: float) -> flo
     return bound * (exponent / 3.0 + math.sqrt((exponent / 3.0) ** 2 + 2.0 * exponent))
 
 
-def _implied_spread(sample: BlockSample, generator: torch.Generator) -> float:
+def _implied_spread(sample: BatchMeans, generator: torch.Generator) -> float:
     """Return the largest standard deviation of n·g_k that B implies."""
     negative = lanczos_spectrum(
-        lambda vector: -sample.implied_product(vector),
+        lambda vector: -sample.model_covariance_product(vector),
         sample.gradients[0],
         generator,
         n_steps=_NORM_STEPS,
@@ -147,7 +147,7 @@ def _implied_spread(sample: BlockSample, generator: torch.Generator) -> float:
 
 
 def _gradient_interval(
-    sample: BlockSample, radius: float, error: float, rng: np.random.Generator
+    sample: BatchMeans, radius: float, error: float, rng: np.random.Generator
 ) -> Interval:
     """Return the interval of ‖∇J‖ of which the upper limit is ``radius`` above ‖ĝ‖.
 
@@ -160,7 +160,7 @@ def _gradient_interval(
         length = float(torch.linalg.vector_norm(learnt))
         if length > 0.0:
             direction = learnt / length
-            implied = float(direction @ sample.implied_product(direction))
+            implied = float(direction @ sample.model_covariance_product(direction))
             held_out = (sample.gradients[1 - half :: 2] @ direction).cpu().numpy()
             spread = math.sqrt(max(0.0, implied))
             lower = max(lower, -upper_limit(-held_out, error / 2.0, rng, least_spread=spread))
@@ -168,7 +168,7 @@ def _gradient_interval(
 
 
 def _curvature_interval(
-    sample: BlockSample,
+    sample: BatchMeans,
     spectrum: Spectrum,
     inflation: float,
     multiplier: float,

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from sb3_crpn.cubic import krylov_basis
-from sb3_crpn.sosp.implied import Operator
+from sb3_crpn.sosp.model_covariance import Operator
 
 FloatArray = npt.NDArray[np.float64]
 

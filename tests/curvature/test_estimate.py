@@ -3,9 +3,9 @@ import pytest
 import torch
 from torch.func import jacrev
 
-from sb3_crpn.curvature import EpisodeOperator, PairWeights, estimate_curvature
+from sb3_crpn.curvature import GroupedOperator, PairWeights, estimate_curvature
+from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from sb3_crpn.curvature.estimate import relative_noise
-from sb3_crpn.curvature.scores import EpisodeGroup
 from tests.mdp import differs, random_mdp, random_parameters, tabular_crpn
 from tests.policies import frozen_episodes, small_policy
 
@@ -81,7 +81,7 @@ def test_groups_of_episodes_add_up_to_the_whole_batch(frozen):
     policy, actor, batch = frozen
     pair_weights = PairWeights("causal", 0.9)
     estimate = estimate_curvature(policy, actor, batch, batch, pair_weights)
-    whole = EpisodeGroup(policy, actor, batch, pair_weights)
+    whole = EpisodeDerivatives(policy, actor, batch, pair_weights)
     v = torch.linspace(-1.0, 1.0, len(actor), dtype=torch.float64)
     torch.testing.assert_close(estimate.gradient, whole.gradient())
     torch.testing.assert_close(estimate.hessian @ v, whole.hessian_product(v))
@@ -96,8 +96,8 @@ def test_gradient_and_hessian_may_come_from_different_episodes(frozen):
     few = batch.take(np.array([3, 0]))
     estimate = estimate_curvature(policy, actor, few, batch, pair_weights)
     v = torch.ones(len(actor), dtype=torch.float64)
-    of_few = EpisodeGroup(policy, actor, few, pair_weights)
-    of_all = EpisodeGroup(policy, actor, batch, pair_weights)
+    of_few = EpisodeDerivatives(policy, actor, few, pair_weights)
+    of_all = EpisodeDerivatives(policy, actor, batch, pair_weights)
     torch.testing.assert_close(estimate.gradient, of_few.gradient())
     torch.testing.assert_close(estimate.fisher @ v, of_few.fisher_product(v))
     torch.testing.assert_close(estimate.hessian @ v, of_all.hessian_product(v))
@@ -190,14 +190,14 @@ def test_the_operator_is_linear_and_symmetric(frozen):
 
 @pytest.mark.parametrize("shape", [(), (3,), (3, 4), (4, 1, 1)])
 def test_operands_of_the_wrong_shape_are_refused(shape):
-    operator = EpisodeOperator(4, lambda v: v[None], torch.ones(1))
+    operator = GroupedOperator(4, lambda v: v[None], torch.ones(1))
     with pytest.raises(ValueError, match=r"operand has shape .* must be \(4,\) or \(4, n\)"):
         operator @ torch.ones(shape)
 
 
 def test_groups_are_weighted_by_their_sizes():
     sizes = torch.tensor([3.0, 1.0], dtype=torch.float64)
-    operator = EpisodeOperator(2, lambda v: torch.stack([v, 5.0 * v]), sizes)
+    operator = GroupedOperator(2, lambda v: torch.stack([v, 5.0 * v]), sizes)
     assert operator.weights.tolist() == [0.75, 0.25]
     assert (operator @ torch.ones(2)).tolist() == [2.0, 2.0]
 

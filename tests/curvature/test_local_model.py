@@ -45,7 +45,7 @@ def test_the_model_in_coordinates_is_the_model_of_the_step(estimate, damping, di
     identity = torch.eye(size, dtype=torch.float64)
     torch.testing.assert_close(model.basis.T @ M @ model.basis, identity, rtol=0, atol=1e-9)
     for y in torch.randn(3, size, dtype=torch.float64, generator=torch.Generator().manual_seed(0)):
-        s = model.lift(y)
+        s = model.to_parameters(y)
         torch.testing.assert_close((s @ M @ s).sqrt(), y.norm())
         torch.testing.assert_close(model.product(y), model.hessian @ y)
         torch.testing.assert_close(
@@ -105,7 +105,7 @@ def test_the_full_model_knows_the_hessian_by_products(estimate):
     assert model.hessian is None
     assert model.products == 0
     assert model.gradient is estimate.gradient
-    assert torch.equal(model.lift(v), v)
+    assert torch.equal(model.to_parameters(v), v)
     torch.testing.assert_close(model.product(v), 0.5 * (estimate.hessian @ v))
 
 
@@ -114,7 +114,7 @@ def test_the_full_model_knows_the_hessian_by_products(estimate):
 def test_shrinkage_is_measured_between_two_groups_in_whitened_coordinates(damping, dim):
     policy, actor = small_policy("gaussian")
     batch = frozen_episodes(policy, (1,) * 301)
-    batch = replace(batch, weights=(batch.actions**2).sum(1).double().numpy())
+    batch = replace(batch, cost_advantages=(batch.actions**2).sum(1).double().numpy())
     estimate = estimate_curvature(policy, actor, batch, batch, PairWeights("causal", 0.9))
     model = projected_model(estimate, damping=damping, dim=dim, shrinkage=None)
     identity = torch.eye(len(estimate.gradient), dtype=torch.float64)
@@ -163,7 +163,7 @@ def change_of_outputs(kind, mixing, damping):
     batch = frozen_episodes(small_policy(kind, net_arch=())[0], LENGTHS)
     estimate = estimate_curvature(policy, actor, batch, batch, PairWeights("causal", 0.9))
     model = projected_model(estimate, damping=damping, dim=None, shrinkage=None)
-    step = model.lift(solve_dense(model.gradient, model.hessian, ALPHA).step)
+    step = model.to_parameters(solve_dense(model.gradient, model.hessian, ALPHA).step)
 
     def outputs():
         with torch.no_grad():

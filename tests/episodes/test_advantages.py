@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_crpn.episodes.advantages import cost_weights, generalized_advantages
+from sb3_crpn.episodes.advantages import cost_advantages, generalized_advantages
 from sb3_crpn.episodes.batch import episode_starts
 
 LENGTHS = st.lists(st.integers(1, 7), min_size=1, max_size=6)
@@ -69,10 +69,10 @@ def test_weights_are_costs_normalised_and_discounted_on_request():
     advantages = np.array([1.0, -2.0, 0.5, 4.0, -1.0])
     options = {"gamma": 0.5, "normalize_advantage": False, "discount_visitation": False}
     original = advantages.copy()
-    np.testing.assert_array_equal(cost_weights(advantages, lengths, **options), -advantages)
-    discounted = cost_weights(advantages, lengths, **options | {"discount_visitation": True})
+    np.testing.assert_array_equal(cost_advantages(advantages, lengths, **options), -advantages)
+    discounted = cost_advantages(advantages, lengths, **options | {"discount_visitation": True})
     np.testing.assert_array_equal(discounted, -advantages * [1, 0.5, 1, 0.5, 0.25])
-    normalised = cost_weights(advantages, lengths, **options | {"normalize_advantage": True})
+    normalised = cost_advantages(advantages, lengths, **options | {"normalize_advantage": True})
     assert normalised.mean() == pytest.approx(0.0, abs=1e-12)
     assert normalised.std() == pytest.approx(1.0)
     assert np.corrcoef(normalised, advantages)[0, 1] == pytest.approx(-1.0)

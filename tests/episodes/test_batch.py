@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from sb3_crpn.episodes import EpisodeBatch, episode_scan
 from sb3_crpn.episodes.batch import (
     concatenate,
-    deal,
     episode_starts,
     episode_time,
     map_observations,
+    round_robin_split,
 )
 
 LENGTHS = st.lists(st.integers(1, 7), min_size=1, max_size=6)
@@ -63,7 +63,7 @@ def numbered_batch(lengths, *, is_dict=False):
         observations={"a": tensor, "b": -tensor[:, None]} if is_dict else tensor[:, None],
         actions=tensor.long(),
         lengths=np.array(lengths),
-        weights=steps,
+        cost_advantages=steps,
         values=steps + 0.5,
         returns=-steps,
         rewards=2 * steps,
@@ -81,7 +81,7 @@ def test_take_selects_whole_episodes_in_the_order_given(is_dict):
     assert taken.n_steps == 5
     assert taken.lengths.tolist() == [3, 2]
     assert taken.actions.tolist() == steps
-    assert taken.weights.tolist() == steps
+    assert taken.cost_advantages.tolist() == steps
     assert taken.values.tolist() == [i + 0.5 for i in steps]
     assert taken.returns.tolist() == [-i for i in steps]
     if is_dict:
@@ -99,20 +99,20 @@ def test_split_deals_every_episode_once(lengths, n_groups):
     sizes = [group.n_episodes for group in groups]
     assert len(groups) == min(n_groups, len(lengths))
     assert max(sizes) - min(sizes) <= 1
-    steps = np.concatenate([group.weights for group in groups])
-    assert np.array_equal(np.sort(steps), batch.weights)
+    steps = np.concatenate([group.cost_advantages for group in groups])
+    assert np.array_equal(np.sort(steps), batch.cost_advantages)
     for group in groups:
         starts = episode_starts(group.lengths)
         assert np.array_equal(
-            group.weights,
-            episode_time(group.lengths) + np.repeat(group.weights[starts], group.lengths),
+            group.cost_advantages,
+            episode_time(group.lengths) + np.repeat(group.cost_advantages[starts], group.lengths),
         )
     assert batch.split(1) == [batch]
 
 
 @given(st.integers(0, 20), st.integers(1, 8), st.integers(0, 20))
 def test_every_episode_is_dealt_once(n_episodes, n_groups, first):
-    groups = deal(n_episodes, n_groups, first)
+    groups = round_robin_split(n_episodes, n_groups, first)
     sizes = [len(group) for group in groups]
     assert len(groups) == n_groups
     assert max(sizes) - min(sizes) <= 1
@@ -123,9 +123,11 @@ def test_every_episode_is_dealt_once(n_episodes, n_groups, first):
 
 @given(st.lists(st.integers(0, 6), min_size=1, max_size=4), st.integers(1, 3))
 def test_dealing_goes_on_where_another_rank_stopped(counts, n_groups):
-    whole = deal(sum(counts), n_groups)
+    whole = round_robin_split(sum(counts), n_groups)
     starts = np.cumsum(counts) - counts
-    parts = [deal(n, n_groups, first=start) for n, start in zip(counts, starts, strict=True)]
+    parts = [
+        round_robin_split(n, n_groups, first=start) for n, start in zip(counts, starts, strict=True)
+    ]
     for k, group in enumerate(whole):
         joined = [part[k] + start for part, start in zip(parts, starts, strict=True)]
         assert np.array_equal(np.concatenate(joined), group)
@@ -135,22 +137,24 @@ def test_dealing_goes_on_where_another_rank_stopped(counts, n_groups):
 @settings(deadline=None)
 def test_pieces_are_runs_of_whole_episodes_within_the_limit(lengths, max_steps):
     batch = numbered_batch(lengths)
-    pieces = batch.pieces(max_steps)
-    assert np.array_equal(np.concatenate([piece.weights for piece in pieces]), batch.weights)
+    pieces = batch.chunks(max_steps)
+    assert np.array_equal(
+        np.concatenate([piece.cost_advantages for piece in pieces]), batch.cost_advantages
+    )
     assert np.array_equal(np.concatenate([piece.lengths for piece in pieces]), lengths)
     for piece, following in zip(pieces, [*pieces[1:], None], strict=True):
         assert piece.n_steps <= max_steps or piece.n_episodes == 1
         assert piece.actions.data_ptr() >= batch.actions.data_ptr()
         if following is not None:
             assert piece.n_steps + following.lengths[0] > max_steps
-    assert batch.pieces(None) == [batch]
+    assert batch.chunks(None) == [batch]
 
 
 def test_nothing_has_no_pieces():
     nothing = numbered_batch([2, 1]).take(np.arange(0))
     assert nothing.n_episodes == nothing.n_steps == 0
-    assert nothing.pieces(None) == nothing.pieces(3) == []
-    assert episode_scan(nothing.weights, 0.5, nothing.lengths, reverse=True).shape == (0,)
+    assert nothing.chunks(None) == nothing.chunks(3) == []
+    assert episode_scan(nothing.cost_advantages, 0.5, nothing.lengths, reverse=True).shape == (0,)
 
 
 def test_map_observations_reaches_every_key():

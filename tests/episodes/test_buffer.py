@@ -5,7 +5,7 @@ from gymnasium import spaces
 
 from sb3_crpn.episodes import DictEpisodeRolloutBuffer, EpisodeRolloutBuffer
 from sb3_crpn.episodes.advantages import generalized_advantages
-from sb3_crpn.episodes.quota import EpisodeEnd
+from sb3_crpn.episodes.tracker import EpisodeEnd
 
 N_ENVS = 2
 GAMMA, GAE_LAMBDA = 0.9, 0.8
@@ -79,7 +79,7 @@ def test_storage_grows_and_keeps_what_it_holds(capacity):
     np.testing.assert_array_equal(batch.observations, kept(added, 0))
     np.testing.assert_array_equal(batch.actions, kept(added, 1))
     np.testing.assert_array_equal(batch.values, kept(added, 3))
-    np.testing.assert_allclose(batch.weights, -expected_advantages(added), atol=1e-6)
+    np.testing.assert_allclose(batch.cost_advantages, -expected_advantages(added), atol=1e-6)
 
 
 def test_a_reset_buffer_is_empty_and_keeps_its_capacity():
@@ -108,7 +108,7 @@ def test_weights_are_negative_advantages(baseline, normalize_advantage, discount
         expected = (expected - expected.mean()) / expected.std()
     if discount_visitation:
         expected = expected * GAMMA ** np.concatenate([np.arange(n) for n in (2, 4, 5)])
-    np.testing.assert_allclose(batch.weights, -expected, atol=1e-6)
+    np.testing.assert_allclose(batch.cost_advantages, -expected, atol=1e-6)
     np.testing.assert_allclose(batch.returns, returns, atol=1e-6)
 
 

@@ -7,7 +7,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_crpn.episodes.batch import episode_starts, episode_time
-from sb3_crpn.sosp.episodes import collect_episodes, undisturbed, with_baseline
+from sb3_crpn.sosp.episodes import collect_episodes, preserve_state, with_baseline
 from tests.envs import Drift
 from tests.training import several
 
@@ -38,7 +38,7 @@ def test_weights_are_discounted_costs_to_go(horizon):
     for start, length in zip(episode_starts(batch.lengths), batch.lengths, strict=True):
         episode = slice(start, start + length)
         costs = -discounted[episode][::-1].cumsum()[::-1]
-        np.testing.assert_allclose(batch.weights[episode], costs, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(batch.cost_advantages[episode], costs, rtol=1e-5, atol=1e-5)
 
 
 def test_every_environment_has_its_quota():
@@ -53,7 +53,7 @@ def test_the_baseline_is_the_critic():
     policy = policy_of(env)
     batch = collect_episodes(policy, env, 3, gamma=GAMMA)
     values = policy.predict_values(batch.observations).flatten().detach().numpy()
-    added = with_baseline(policy, batch, GAMMA).weights - batch.weights
+    added = with_baseline(policy, batch, GAMMA).cost_advantages - batch.cost_advantages
     np.testing.assert_allclose(added, GAMMA ** episode_time(batch.lengths) * values, rtol=1e-5)
 
 
@@ -78,7 +78,7 @@ def test_nothing_is_left_behind(fails):
     noise, state = policy.action_dist.exploration_mat, torch.get_rng_state()
     statistics = env.obs_rms.mean.copy()
     try:
-        with undisturbed(policy, env, seed=1):
+        with preserve_state(policy, env, seed=1):
             assert not policy.training
             collect_episodes(policy, env, 2, gamma=GAMMA)
             assert policy.action_dist.exploration_mat is not noise

@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 import torch
 
-from sb3_crpn.sosp.blocks import BlockSample
+from sb3_crpn.sosp.batch_means import BatchMeans
 from sb3_crpn.sosp.inference import (
     bernstein_intervals,
     bernstein_radius,
     bootstrap_intervals,
     upper_limit,
 )
+from sb3_crpn.sosp.robust import worst_curvature
 from sb3_crpn.sosp.spectrum import lanczos_spectrum
-from sb3_crpn.sosp.worst import worst_curvature
 
 
 def noisy_sample(gradient, hessian, noise, n_blocks, seed):
@@ -23,7 +23,7 @@ def noisy_sample(gradient, hessian, noise, n_blocks, seed):
     shape = {"dtype": torch.float64, "generator": generator}
     gradients = gradient + noise * torch.randn(n_blocks, d, **shape)
     root = torch.randn(n_blocks, d, d, **shape)
-    return BlockSample.from_matrices(
+    return BatchMeans.from_matrices(
         gradients,
         hessian + 0.5 * noise * (root + root.transpose(1, 2)),
         torch.zeros(d, d, dtype=torch.float64),
@@ -85,7 +85,7 @@ def test_the_intervals_are_exact_without_noise():
 
 def test_blocks_that_show_nothing_prove_nothing():
     zeros = torch.zeros(10, 3, 3, dtype=torch.float64)
-    sample = BlockSample.from_matrices(zeros[:, 0], zeros, zeros[0])
+    sample = BatchMeans.from_matrices(zeros[:, 0], zeros, zeros[0])
     of_norm, of_curvature = intervals_of(sample)
     assert of_norm.upper == math.inf
     assert of_curvature.lower == -math.inf
@@ -97,7 +97,7 @@ def test_what_the_probabilities_imply_widens_the_intervals():
     sample = noisy_sample(g, H, 0.1, 10, 0)
     widths, previous = [], None
     for implied in (0.0, 0.15, 0.25, 1.0):
-        wider = replace(sample, implied_product=lambda v, b=implied: b**2 * v)
+        wider = replace(sample, model_covariance_product=lambda v, b=implied: b**2 * v)
         intervals = intervals_of(wider)
         widths.append([interval.upper - interval.lower for interval in intervals])
         if previous is not None:

@@ -4,7 +4,7 @@ import torch
 from torch.func import jacrev
 
 from sb3_crpn.curvature import PairWeights
-from sb3_crpn.curvature.scores import EpisodeGroup
+from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.theory import Constants, ScoreBounds, softmax_linear
 from tests.mdp import TabularMDP, random_mdp, random_parameters, tabular_crpn
@@ -78,7 +78,9 @@ def episode_estimates(policy, actor, batch, estimator="trajectory"):
     eye = torch.eye(len(actor), dtype=torch.float64)
     gradients, hessians = [], []
     for episode in range(batch.n_episodes):
-        group = EpisodeGroup(policy, actor, batch.take(np.array([episode])), PairWeights(estimator))
+        group = EpisodeDerivatives(
+            policy, actor, batch.take(np.array([episode])), PairWeights(estimator)
+        )
         gradients.append(group.gradient())
         hessians.append(torch.stack([group.hessian_product(v) for v in eye]))
     return torch.stack(gradients), torch.stack(hessians)
@@ -112,7 +114,7 @@ def test_estimates_of_single_episodes_are_attained():
         observations=torch.tensor([[1.0, 0.0]], dtype=torch.float64).repeat(H, 1),
         actions=torch.zeros(H),
         lengths=np.array([H]),
-        weights=cost_to_go.copy(),
+        cost_advantages=cost_to_go.copy(),
         values=np.zeros(H),
         returns=np.zeros(H),
         rewards=np.zeros(H),

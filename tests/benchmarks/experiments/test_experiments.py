@@ -81,6 +81,6 @@ def test_baselines_take_away_variance_and_no_truth(kind):
     )
     assert not differs(hessians, mdp.hessian(theta))
     assert differs(hessians, mdp.hessian(theta) + 1.0)
-    costs = np.concatenate([batch.weights for batch in batches])
-    advantages = [variance._less_baseline(mdp, batch, values).weights for batch in batches]
+    costs = np.concatenate([batch.cost_advantages for batch in batches])
+    advantages = [variance._less_baseline(mdp, batch, values).cost_advantages for batch in batches]
     assert np.std(np.concatenate(advantages)) < np.std(costs)

@@ -16,16 +16,16 @@ from stable_baselines3.common.policies import (
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_crpn.base.arguments import check_arguments, check_sb3_arguments
-from sb3_crpn.base.critic import fuse
-from sb3_crpn.base.random_state import RandomState
-from sb3_crpn.base.update import PolicyNewtonUpdate
-from sb3_crpn.curvature.scores import HessianEstimator
+from sb3_crpn.algorithm.arguments import check_arguments, check_sb3_arguments
+from sb3_crpn.algorithm.critic import fuse
+from sb3_crpn.algorithm.random_state import RandomState
+from sb3_crpn.algorithm.update import PolicyNewtonUpdate
+from sb3_crpn.curvature.derivatives import HessianEstimator
 from sb3_crpn.distributed import rank
 from sb3_crpn.episodes import (
     DictEpisodeRolloutBuffer,
-    EarlierRollouts,
     EpisodeRolloutBuffer,
+    Replay,
 )
 from sb3_crpn.parameters import ActorParameters
 
@@ -60,7 +60,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         differ, max(m_k, b_k) are simulated and each set is drawn without replacement.
     n_reused_rollouts
         Most earlier rollouts of the same call of ``learn`` that join each update, reweighted to
-        the present policy (:class:`~sb3_crpn.episodes.EarlierRollouts`), which ends for a rollout
+        the present policy (:class:`~sb3_crpn.episodes.Replay`), which ends for a rollout
         that has become too unlike it; 0: none, as in the paper.
     alpha
         α of the cubic term, a float or a schedule. With ``target_kl`` only the first guess.
@@ -237,7 +237,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         super()._setup_model()
         fuse(self.policy.optimizer)
         self.alpha_schedule = FloatSchedule(self.alpha)
-        self.earlier_rollouts = EarlierRollouts(self.n_reused_rollouts, self.gamma, self.gae_lambda)
+        self.replay = Replay(self.n_reused_rollouts, self.gamma, self.gae_lambda)
         self.actor = self._find_actor()
 
     def _find_actor(self) -> ActorParameters:
@@ -249,7 +249,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         return ActorParameters.reachable(self.policy, log_prob)
 
     def _excluded_save_params(self) -> list[str]:
-        own = ["actor", "alpha_schedule", "earlier_rollouts", "_collecting", "_statistics"]
+        own = ["actor", "alpha_schedule", "replay", "_collecting", "_statistics"]
         return [*super()._excluded_save_params(), *own]
 
     def learn(
@@ -262,7 +262,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         progress_bar: bool = False,
     ) -> Self:
         """Train for at least ``total_timesteps``, as SB3's algorithms do."""
-        self.earlier_rollouts.clear()  # the environment may be another one
+        self.replay.clear()  # the environment may be another one
         return super().learn(
             total_timesteps=total_timesteps,
             callback=callback,

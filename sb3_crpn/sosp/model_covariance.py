@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.distributions import Bernoulli, Categorical
 from torch.nn.functional import logsigmoid
 
-from sb3_crpn.curvature.scores import policy_distribution
+from sb3_crpn.curvature.derivatives import policy_distribution
 from sb3_crpn.episodes.batch import EpisodeBatch, episode_time
 from sb3_crpn.parameters import ActorParameters
 
@@ -24,7 +24,7 @@ Operator = Callable[[Tensor], Tensor]
 RARE = 5.0
 
 
-def implied_covariance(
+def model_covariance(
     policy: ActorCriticPolicy,
     actor: ActorParameters,
     batch: EpisodeBatch,
@@ -48,11 +48,11 @@ def implied_covariance(
         reference = policy_distribution(policy, batch)
     current = policy_distribution(policy, batch)
     divergence = kl_divergence(reference, current).reshape(batch.n_steps, -1).sum(1)
-    potential = (divergence.new_tensor(batch.weights**2) * divergence).sum()
+    potential = (divergence.new_tensor(batch.cost_advantages**2) * divergence).sum()
     log_probs = _log_probabilities(current)
     if log_probs is not None:
         costs = gamma ** episode_time(batch.lengths) * batch.returns
-        scale = log_probs.new_tensor(np.abs(costs) + np.abs(batch.weights + costs))
+        scale = log_probs.new_tensor(np.abs(costs) + np.abs(batch.cost_advantages + costs))
         weights = _rare_probabilities(log_probs.detach()) * scale[:, None] ** 2
         potential = potential + 0.5 * (weights * (log_probs - log_probs.detach()) ** 2).sum()
     slope = torch.autograd.grad(potential, actor.tensors, create_graph=True, materialize_grads=True)

@@ -78,7 +78,7 @@ class EpisodeTracker:
         return not self._remaining.any()
 
     @property
-    def stalled(self) -> bool:
+    def needs_reset(self) -> bool:
         """Whether episodes are missing and none is being recorded: a reset would start them."""
         return not self.complete and not self._recording.any()
 

@@ -11,11 +11,11 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_crpn.base.arguments import check_integer, check_real
-from sb3_crpn.base.collection import EpisodeCollection
-from sb3_crpn.base.critic import fit_critic
-from sb3_crpn.base.step import PolicyStep, take_step
-from sb3_crpn.base.trial import StepTester
+from sb3_crpn.algorithm.arguments import check_integer, check_real
+from sb3_crpn.algorithm.collection import EpisodeCollection
+from sb3_crpn.algorithm.critic import fit_critic
+from sb3_crpn.algorithm.evaluation import CandidateEvaluator
+from sb3_crpn.algorithm.step import PolicyStep, take_step
 from sb3_crpn.cubic import CubicStep
 from sb3_crpn.curvature import (
     CurvatureEstimate,
@@ -25,12 +25,12 @@ from sb3_crpn.curvature import (
     full_model,
     projected_model,
 )
-from sb3_crpn.curvature.scores import HessianEstimator
-from sb3_crpn.distributed import broadcast_state, gather_counts, mean_and_variance, share
+from sb3_crpn.curvature.derivatives import HessianEstimator
+from sb3_crpn.distributed import broadcast_state, gather_counts, local_count, mean_and_variance
 from sb3_crpn.episodes import (
-    EarlierRollouts,
     EpisodeBatch,
     EpisodeRolloutBuffer,
+    Replay,
     concatenate,
 )
 from sb3_crpn.parameters import ActorParameters
@@ -41,18 +41,18 @@ from sb3_crpn.parameters import ActorParameters
 KRYLOV_DIM = 10
 
 # Steps are shortened where the returns' standard deviation is below this fraction of its recent
-# maximum, which fades by the factor MEMORY an update
-FULL_SIGNAL = 0.2
-MEMORY = 0.99
+# maximum, which fades by the factor SCALE_DECAY an update
+FULL_KL_FRACTION = 0.2
+SCALE_DECAY = 0.99
 # The shortest, a hundredth: its KL divergence can still be told from 0 in single precision
-MIN_SIGNAL = 1e-2
+MIN_KL_SCALE = 1e-2
 
 
 class PolicyNewtonUpdate(EpisodeCollection):
     """The update of DESIGN section 5; the subclass brings the arguments and the solver."""
 
     actor: ActorParameters
-    earlier_rollouts: EarlierRollouts
+    replay: Replay
     n_episodes: int | Schedule | None
     n_hessian_episodes: int | Schedule | None
     alpha_schedule: Schedule
@@ -77,14 +77,14 @@ class PolicyNewtonUpdate(EpisodeCollection):
         self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
         batch = self._episode_batch(self.rollout_buffer)
-        earlier = self.earlier_rollouts.reweighted(self.policy, **self._weighting)
+        earlier = self.replay.reweighted(self.policy, **self._weighting)
         estimate = self._estimate(batch, earlier)
         model = self._local_model(estimate)
         target_kl = self._scaled_target_kl(batch)
         step = self._take_step(estimate.gradient_batch, model, target_kl)
         value_loss = self._fit_critic(batch, earlier)
         if step.trial.finite:  # what spoilt one step would spoil the next ones
-            self.earlier_rollouts.append(batch)
+            self.replay.append(batch)
         broadcast_state(self.policy)
         self._n_updates += 1
         self._log_update(batch, len(earlier), estimate, model, step, target_kl, value_loss)
@@ -169,7 +169,9 @@ class PolicyNewtonUpdate(EpisodeCollection):
         """Draw this rank's share of episodes without replacement; all are the batch itself."""
         if n_episodes is None or n_episodes >= n_simulated:
             return batch
-        return batch.take(self._rng.choice(batch.n_episodes, share(n_episodes), replace=False))
+        return batch.take(
+            self._rng.choice(batch.n_episodes, local_count(n_episodes), replace=False)
+        )
 
     def _prefers_dense(self) -> bool:
         """Whether the model is to be written out on all of ℝᵈ."""
@@ -208,10 +210,10 @@ class PolicyNewtonUpdate(EpisodeCollection):
         deviation = self._reward_unit() * math.sqrt(mean_and_variance(batch.returns)[1])
         if not math.isfinite(deviation):  # nor is the step, which is rejected
             return self.target_kl
-        self._return_scale = max(deviation, MEMORY * self._return_scale)
-        full = FULL_SIGNAL * self._return_scale
+        self._return_scale = max(deviation, SCALE_DECAY * self._return_scale)
+        full = FULL_KL_FRACTION * self._return_scale
         signal = deviation / full if full else 1.0
-        return self.target_kl * min(1.0, max(MIN_SIGNAL, signal)) ** 2
+        return self.target_kl * min(1.0, max(MIN_KL_SCALE, signal)) ** 2
 
     def _reward_unit(self) -> float:
         """Return what ``VecNormalize`` divides rewards by, √(Var[Σγ^h r_h] + ε); else 1."""
@@ -228,7 +230,7 @@ class PolicyNewtonUpdate(EpisodeCollection):
         if target_kl is not None and self._fitted_alpha is not None:
             alpha = self._fitted_alpha
         step = take_step(
-            StepTester(self.policy, self.actor, batch, self.max_batch_timesteps),
+            CandidateEvaluator(self.policy, self.actor, batch, self.max_batch_timesteps),
             model,
             lambda alpha: self._solve(model, alpha),
             alpha,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from sb3_crpn.base.trial import StepTester, Trial, fit_alpha
+from sb3_crpn.algorithm.evaluation import CandidateEvaluator, StepEvaluation, fit_alpha
 from sb3_crpn.cubic import CubicStep
 from sb3_crpn.curvature import LocalModel
 
@@ -33,7 +33,7 @@ class PolicyStep:
     cubic: CubicStep
     norm: float
     alpha: float
-    trial: Trial
+    trial: StepEvaluation
     rejected: bool
 
     def log(self) -> dict[str, float]:
@@ -51,7 +51,7 @@ class PolicyStep:
 
 
 def take_step(
-    tester: StepTester,
+    tester: CandidateEvaluator,
     model: LocalModel,
     solve: Callable[[float], CubicStep],
     alpha: float,
@@ -77,10 +77,10 @@ def take_step(
         Mean KL divergence to keep; ``None``: no bound.
     """
 
-    def attempt(alpha: float) -> tuple[CubicStep, torch.Tensor, Trial]:
+    def attempt(alpha: float) -> tuple[CubicStep, torch.Tensor, StepEvaluation]:
         cubic = solve(alpha)
-        step = model.lift(cubic.step)
-        return cubic, step, tester.try_step(step)
+        step = model.to_parameters(cubic.step)
+        return cubic, step, tester.evaluate(step)
 
     try:
         if target_kl is not None:

@@ -10,7 +10,7 @@ import torch
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_crpn.curvature.scores import mean_divergence, policy_distribution
+from sb3_crpn.curvature.derivatives import mean_divergence, policy_distribution
 from sb3_crpn.distributed import all_sum, broadcast
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.parameters import ActorParameters
@@ -24,7 +24,7 @@ LOG_MIN_ALPHA = math.log(1e-30)
 
 
 @dataclass(frozen=True)
-class Trial:
+class StepEvaluation:
     """What a step does on the batch.
 
     Attributes
@@ -44,7 +44,7 @@ class Trial:
         return math.isfinite(self.kl) and math.isfinite(self.surrogate_change)
 
 
-class StepTester:
+class CandidateEvaluator:
     """Moves the actor to θ + s and back, one forward pass a trial.
 
     Parameters
@@ -69,22 +69,22 @@ class StepTester:
         self._origin = actor.snapshot()
         self._vector = actor.vector
         self._pieces: list[tuple[EpisodeBatch, Distribution, torch.Tensor, torch.Tensor]] = []
-        for piece in batch.pieces(max_steps):
+        for piece in batch.chunks(max_steps):
             with torch.no_grad():
                 reference = policy_distribution(policy, piece)
                 log_prob = reference.log_prob(piece.actions)
-            weights = log_prob.new_tensor(piece.weights)
+            weights = log_prob.new_tensor(piece.cost_advantages)
             self._pieces.append((piece, reference, log_prob, weights))
 
-    def try_step(self, step: torch.Tensor) -> Trial:
+    def evaluate(self, step: torch.Tensor) -> StepEvaluation:
         """Leave the actor at θ + ``step``, [d], of rank 0, and say what that does."""
         step = broadcast(step)
         if not torch.isfinite(step).all():
-            return Trial(math.inf, math.inf)
-        self._actor.restore(self._actor.unflatten(self._vector + step))
+            return StepEvaluation(math.inf, math.inf)
+        self._actor.load(self._actor.unflatten(self._vector + step))
         sums = torch.tensor(self._sums(), dtype=torch.float64)
         divergence, change, n_steps, n_episodes = all_sum(torch.cat([sums, self._sizes])).tolist()
-        return Trial(divergence / n_steps, change / n_episodes)
+        return StepEvaluation(divergence / n_steps, change / n_episodes)
 
     def _sums(self) -> tuple[float, float]:
         """Return Σ_i KL_i and Σ_i A_i (π_θ+s/π_θ - 1) over this rank's steps."""
@@ -103,7 +103,7 @@ class StepTester:
 
     def restore(self) -> None:
         """Put the actor back to θ, bit for bit."""
-        self._actor.restore(self._origin)
+        self._actor.load(self._origin)
 
 
 def fit_alpha(kl: Callable[[float], float], alpha: float, target: float) -> float:

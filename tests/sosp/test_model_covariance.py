@@ -7,7 +7,7 @@ import torch
 from benchmarks.exact import coordination_mdp
 from sb3_crpn.episodes.batch import episode_time
 from sb3_crpn.sosp import certify_sosp, implied
-from sb3_crpn.sosp.implied import implied_covariance
+from sb3_crpn.sosp.model_covariance import model_covariance
 from tests.policies import flat_gradient, frozen_episodes, small_policy
 from tests.sosp.test_certificate import tabular
 
@@ -26,7 +26,7 @@ def setting(kind):
 
 
 def dense(policy, actor, batch):
-    operator = implied_covariance(policy, actor, batch, N_BLOCKS, GAMMA)
+    operator = model_covariance(policy, actor, batch, N_BLOCKS, GAMMA)
     return torch.stack([operator(v) for v in torch.eye(len(actor), dtype=torch.float64)])
 
 
@@ -59,7 +59,7 @@ def test_it_averages_the_actions_at_their_probabilities(kind, monkeypatch):
     monkeypatch.setattr(implied, "RARE", 0.0)
     policy, actor, batch = setting(kind)
     total = 0.0
-    for i, weight in enumerate(batch.weights):
+    for i, weight in enumerate(batch.cost_advantages):
         distribution = distribution_at(policy, batch, i)
         scores = nodes(kind, distribution, lambda x: flat_gradient(x.sum(), actor))
         total = total + weight**2 * expectation(scores)
@@ -81,7 +81,7 @@ def test_the_rarest_actions_count_with_the_cost_to_go(monkeypatch):
     total = 0.0
     for i, a in (probabilities <= least[-1]).nonzero():
         score = flat_gradient(distribution_at(policy, batch, i).log_prob(a[None]).sum(), actor)
-        scale = abs(costs[i]) + abs(batch.weights[i] + costs[i])
+        scale = abs(costs[i]) + abs(batch.cost_advantages[i] + costs[i])
         total = total + probabilities[i, a] * scale**2 * torch.outer(score, score)
     rare = dense(policy, actor, batch) - common
     torch.testing.assert_close(rare, total * N_BLOCKS / batch.n_episodes**2)

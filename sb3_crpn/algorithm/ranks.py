@@ -12,14 +12,14 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_crpn.distributed import all_sum, alone, broadcast, broadcast_state, rank, world_size
+from sb3_crpn.distributed import all_sum, broadcast, broadcast_state, local_mode, rank, world_size
 from sb3_crpn.episodes.batch import FloatArray
 
 
-class Ranks(BaseAlgorithm):
+class DistributedTraining(BaseAlgorithm):
     """Starts all ranks from rank 0's policy and statistics; rank 0 alone logs and calls back."""
 
-    _statistics: SharedStatistics | None = None
+    _statistics: SharedMoments | None = None
 
     def _setup_learn(
         self,
@@ -33,14 +33,14 @@ class Ranks(BaseAlgorithm):
             broadcast_state(self.policy)
             normalizer = self.get_vec_normalize_env()
             # before the first reset adds to them
-            self._statistics = None if normalizer is None else SharedStatistics(normalizer)
+            self._statistics = None if normalizer is None else SharedMoments(normalizer)
         if rank() > 0:
             callback, progress_bar = None, False
             self.set_logger(Logger(folder=None, output_formats=[]))
         total_timesteps, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
-        return total_timesteps, callback if world_size() == 1 else CallbackAlone(callback)
+        return total_timesteps, callback if world_size() == 1 else RankZeroCallback(callback)
 
     def _share_statistics(self) -> None:
         """Add up what the ranks' ``VecNormalize`` have seen since they last agreed."""
@@ -48,7 +48,7 @@ class Ranks(BaseAlgorithm):
             self._statistics.merge()
 
 
-class CallbackAlone(CallbackList):
+class RankZeroCallback(CallbackList):
     """A callback that finds its rank alone, so that it may do all that it may on one process."""
 
     def __init__(self, callback: BaseCallback) -> None:
@@ -57,31 +57,31 @@ class CallbackAlone(CallbackList):
 
     def on_training_start(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
         """Call back, as the following methods do."""
-        with alone():
+        with local_mode():
             super().on_training_start(locals_, globals_)
 
     def on_rollout_start(self) -> None:
         """Call back."""
-        with alone():
+        with local_mode():
             super().on_rollout_start()
 
     def on_step(self) -> bool:
         """Call back."""
-        with alone():
+        with local_mode():
             return super().on_step()
 
     def on_rollout_end(self) -> None:
         """Call back."""
-        with alone():
+        with local_mode():
             super().on_rollout_end()
 
     def on_training_end(self) -> None:
         """Call back."""
-        with alone():
+        with local_mode():
             super().on_training_end()
 
 
-class SharedStatistics:
+class SharedMoments:
     """Makes the running moments of ``VecNormalize`` those of all that the ranks have seen.
 
     During a rollout each rank goes on from the common moments with its own observations and

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from sb3_crpn.base.trial import StepTester, Trial, fit_alpha
+from sb3_crpn.algorithm.evaluation import CandidateEvaluator, StepEvaluation, fit_alpha
 from tests.policies import ACTION_SPACES, frozen_episodes, log_probabilities, small_policy
 
 TARGET = 0.02
@@ -100,10 +100,10 @@ def attempt_of(kind, dtype=torch.float64):
 def test_a_trial_measures_the_surrogate_cost_and_the_divergence(kind):
     policy, actor, batch, step = attempt_of(kind)
     before = log_probabilities(policy, batch).detach()
-    tester = StepTester(policy, actor, batch)
-    trial = tester.try_step(step)
+    tester = CandidateEvaluator(policy, actor, batch)
+    trial = tester.evaluate(step)
     ratio = (log_probabilities(policy, batch).detach() - before).exp()
-    change = (torch.from_numpy(batch.weights) * (ratio - 1.0)).sum() / batch.n_episodes
+    change = (torch.from_numpy(batch.cost_advantages) * (ratio - 1.0)).sum() / batch.n_episodes
     assert trial.surrogate_change == pytest.approx(change.item())
     assert trial.finite
 
@@ -125,9 +125,9 @@ def test_a_trial_measures_the_surrogate_cost_and_the_divergence(kind):
 @pytest.mark.parametrize("kind", ACTION_SPACES)
 def test_a_trial_in_pieces_is_the_same(kind):
     policy, actor, batch, step = attempt_of(kind)
-    whole = StepTester(policy, actor, batch).try_step(step)
+    whole = CandidateEvaluator(policy, actor, batch).evaluate(step)
     actor.assign(actor.vector - step)
-    pieces = StepTester(policy, actor, batch, max_steps=4).try_step(step)
+    pieces = CandidateEvaluator(policy, actor, batch, max_steps=4).evaluate(step)
     assert pieces.kl == pytest.approx(whole.kl, rel=1e-12)
     assert pieces.surrogate_change == pytest.approx(whole.surrogate_change, rel=1e-12)
 
@@ -136,10 +136,10 @@ def test_a_trial_in_pieces_is_the_same(kind):
 def test_restore_is_bitwise(dtype):
     policy, actor, batch, step = attempt_of("gaussian", dtype)
     before = {name: value.clone() for name, value in policy.state_dict().items()}
-    tester = StepTester(policy, actor, batch)
-    tester.try_step(step)
+    tester = CandidateEvaluator(policy, actor, batch)
+    tester.evaluate(step)
     assert not torch.equal(policy.action_net.weight, before["action_net.weight"])
-    tester.try_step(1e30 * step)
+    tester.evaluate(1e30 * step)
     tester.restore()
     for name, value in policy.state_dict().items():
         assert torch.equal(value, before[name])
@@ -147,29 +147,29 @@ def test_restore_is_bitwise(dtype):
 
 def test_trials_start_from_the_origin():
     policy, actor, batch, step = attempt_of("discrete")
-    tester = StepTester(policy, actor, batch)
+    tester = CandidateEvaluator(policy, actor, batch)
     origin = actor.vector
-    first = tester.try_step(step)
-    tester.try_step(-3.0 * step)
-    assert tester.try_step(step) == first
+    first = tester.evaluate(step)
+    tester.evaluate(-3.0 * step)
+    assert tester.evaluate(step) == first
     assert torch.equal(actor.vector, origin + step)
-    assert tester.try_step(torch.zeros_like(step)).kl == pytest.approx(0.0, abs=1e-12)
+    assert tester.evaluate(torch.zeros_like(step)).kl == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_steps_that_are_not_finite_are_not_taken(value):
     policy, actor, batch, step = attempt_of("discrete")
-    tester = StepTester(policy, actor, batch)
+    tester = CandidateEvaluator(policy, actor, batch)
     origin = actor.vector
     step[0] = value
-    assert tester.try_step(step) == Trial(math.inf, math.inf)
+    assert tester.evaluate(step) == StepEvaluation(math.inf, math.inf)
     assert torch.equal(actor.vector, origin)
 
 
 @pytest.mark.parametrize("kind", ACTION_SPACES)
 def test_a_policy_that_overflows_is_not_usable(kind):
     policy, actor, batch, step = attempt_of(kind, torch.float32)
-    tester = StepTester(policy, actor, batch)
-    assert not tester.try_step(1e38 * step.sign()).finite
+    tester = CandidateEvaluator(policy, actor, batch)
+    assert not tester.evaluate(1e38 * step.sign()).finite
     tester.restore()
-    assert tester.try_step(0.1 * step).finite
+    assert tester.evaluate(0.1 * step).finite

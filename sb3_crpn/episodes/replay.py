@@ -10,7 +10,7 @@ import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_crpn.distributed import all_sum
-from sb3_crpn.episodes.advantages import cost_weights, generalized_advantages
+from sb3_crpn.episodes.advantages import cost_advantages, generalized_advantages
 from sb3_crpn.episodes.batch import EpisodeBatch, FloatArray
 from sb3_crpn.episodes.buffer import CHUNK
 
@@ -23,7 +23,7 @@ MAX_RATIO = 2.0
 MIN_EFFECTIVE_SIZE = 0.5
 
 
-class EarlierRollouts:
+class Replay:
     """The last rollouts, reweighted to the present policy on demand.
 
     With ρ_i = π(a_i|s_i)/π_then(a_i|s_i) and c_i = min(1, ρ_i), a step counts with
@@ -91,7 +91,7 @@ class EarlierRollouts:
             self._gae_lambda,
             traces,
         )
-        weights = cost_weights(
+        weights = cost_advantages(
             advantages if baseline else advantages + values,
             batch.lengths,
             gamma=self._gamma,
@@ -100,7 +100,7 @@ class EarlierRollouts:
         )
         return replace(
             batch,
-            weights=np.minimum(ratios, MAX_RATIO) * weights,
+            cost_advantages=np.minimum(ratios, MAX_RATIO) * weights,
             values=values,
             returns=values + traces * advantages,
         )
@@ -109,7 +109,7 @@ class EarlierRollouts:
 def _evaluate(policy: ActorCriticPolicy, batch: EpisodeBatch) -> tuple[FloatArray, FloatArray]:
     """Return V(s_i) and ρ_i of the present policy, [T] each."""
     values, log_probs = [np.zeros(0)], [np.zeros(0)]
-    for piece in batch.pieces(CHUNK):
+    for piece in batch.chunks(CHUNK):
         with torch.no_grad():
             value, log_prob, _ = policy.evaluate_actions(piece.observations, piece.actions)
         values.append(value.flatten().cpu().double().numpy())

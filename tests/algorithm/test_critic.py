@@ -11,8 +11,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_crpn import CRPN
-from sb3_crpn.base import update
-from sb3_crpn.base.critic import fit_critic, fuse
+from sb3_crpn.algorithm import update
+from sb3_crpn.algorithm.critic import fit_critic, fuse
 from sb3_crpn.parameters import ActorParameters
 from tests.policies import ACTION_SPACES, OBSERVATION_SPACE, frozen_episodes
 

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.distributions import kl_divergence
 
-from sb3_crpn.curvature.scores import EpisodeGroup, PairWeights, policy_distribution
+from sb3_crpn.curvature.derivatives import EpisodeDerivatives, PairWeights, policy_distribution
 from tests.policies import (
     ACTION_SPACES,
     central_jacobian,
@@ -26,7 +26,7 @@ KINDS = ["discrete", "gaussian"]
 def group_of(kind, estimator="causal", decay=0.9, **options):
     policy, actor = small_policy(kind, **options)
     batch = frozen_episodes(small_policy(kind)[0])
-    group = EpisodeGroup(policy, actor, batch, PairWeights(estimator, decay))
+    group = EpisodeDerivatives(policy, actor, batch, PairWeights(estimator, decay))
     return policy, actor, batch, group
 
 
@@ -68,7 +68,9 @@ def test_pair_weights_take_several_vectors_at_once(case):
 @pytest.mark.parametrize("kind", ACTION_SPACES)
 def test_gradient_is_the_weighted_sum_of_scores(kind):
     policy, actor, batch, group = group_of(kind)
-    expected = torch.from_numpy(batch.weights) @ scores(policy, actor, batch) / batch.n_episodes
+    expected = (
+        torch.from_numpy(batch.cost_advantages) @ scores(policy, actor, batch) / batch.n_episodes
+    )
     torch.testing.assert_close(group.gradient(), expected, rtol=1e-10, atol=1e-12)
 
 
@@ -81,7 +83,7 @@ def test_products_are_those_of_the_dense_hessian(kind, case):
     expected = dense_hessian(policy, actor, batch, *case)
     torch.testing.assert_close(product, expected, rtol=1e-10, atol=1e-12)
     V = torch.randn(len(actor), 3, dtype=torch.float64)
-    form = group.hessian_form(V)
+    form = group.quadratic_form(V)
     torch.testing.assert_close(form, V.T @ expected @ V, rtol=1e-10, atol=1e-11)
 
 
@@ -93,7 +95,7 @@ def test_trajectory_products_differentiate_the_reweighted_gradient(kind):
     def gradient():
         log_prob = log_probabilities(policy, batch)
         log_ratio = (log_prob - reference).detach()
-        weights = torch.from_numpy(batch.weights.copy())
+        weights = torch.from_numpy(batch.cost_advantages.copy())
         for steps in episode_slices(batch):
             weights[steps] *= log_ratio[steps].sum().exp()
         return flat_gradient((weights * log_prob).sum() / batch.n_episodes, actor)
@@ -113,7 +115,7 @@ def test_causal_products_differentiate_the_gradient_of_the_surrogate(kind, decay
         log_ratio = log_probabilities(policy, batch) - reference
         total = 0.0
         for steps in episode_slices(batch):
-            A = torch.from_numpy(batch.weights[steps])
+            A = torch.from_numpy(batch.cost_advantages[steps])
             if decay == 0.0:
                 total = total + A @ log_ratio[steps].exp()
             else:
@@ -148,7 +150,7 @@ def test_one_forward_pass_serves_all_products_at_two_backward_passes_each(monkey
         group.fisher_product(torch.randn(len(actor), dtype=torch.float64))
     assert calls == {"forward": 2, "backward": 1 + 2 * 5 + 1 + 5}
     calls["backward"] = 0
-    group.hessian_form(torch.randn(len(actor), 5, dtype=torch.float64))
+    group.quadratic_form(torch.randn(len(actor), 5, dtype=torch.float64))
     assert calls == {"forward": 2, "backward": 5}
 
 

@@ -10,10 +10,10 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_crpn import CRPN
-from sb3_crpn.base import collection
+from sb3_crpn.algorithm import collection
 from sb3_crpn.episodes import EpisodeTracker, episodes_per_env, steps_to_quota
 from sb3_crpn.episodes.batch import episode_starts, episode_time
-from sb3_crpn.episodes.quota import EpisodeEnd
+from sb3_crpn.episodes.tracker import EpisodeEnd
 from tests.mdp import differs, random_mdp, random_parameters, tabular_crpn
 
 
@@ -46,7 +46,7 @@ def test_each_environment_delivers_its_first_episodes_however_long():
         EpisodeEnd(1, 0, 5, False),
     ]
     assert tracker.complete
-    assert not tracker.stalled
+    assert not tracker.needs_reset
 
 
 def test_what_began_before_the_rollout_is_not_an_episode():
@@ -59,15 +59,15 @@ def test_the_horizon_cuts_and_a_restart_begins_the_next_episode():
     tracker = EpisodeTracker(np.array([2, 1]), np.array([True, True]), horizon=2)
     ends = run(tracker, [[0, 0], [1, 0]])
     assert ends == [EpisodeEnd(0, 0, 2, False), EpisodeEnd(1, 0, 2, True)]
-    assert not tracker.stalled
+    assert not tracker.needs_reset
     assert run(tracker, [[0, 0], [0, 1]]) == [EpisodeEnd(0, 2, 2, True)]
     assert tracker.complete
 
     tracker = EpisodeTracker(np.array([2]), np.array([True]), horizon=2)
     run(tracker, [[0], [0], [0]])
-    assert tracker.stalled
+    assert tracker.needs_reset
     tracker.restart()
-    assert not tracker.stalled
+    assert not tracker.needs_reset
     assert run(tracker, [[0], [0]]) == [EpisodeEnd(0, 3, 2, True)]
 
 

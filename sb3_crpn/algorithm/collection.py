@@ -16,11 +16,11 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_crpn.base.ranks import Ranks
-from sb3_crpn.distributed import all_sum, share, world_size
+from sb3_crpn.algorithm.ranks import DistributedTraining
+from sb3_crpn.distributed import all_sum, local_count, world_size
 from sb3_crpn.episodes import EpisodeRolloutBuffer, EpisodeTracker, episodes_per_env, steps_to_quota
 from sb3_crpn.episodes.batch import IntArray
-from sb3_crpn.episodes.quota import EpisodeEnd
+from sb3_crpn.episodes.tracker import EpisodeEnd
 
 # An environment is taken to be endless when no episode ends within so many steps: nearly twice
 # the longest episode in common use (Atari's 108,000 frames at a frame skip of 4).
@@ -32,7 +32,7 @@ _COUNTERS = ("num_timesteps", "ep_info_buffer", "ep_success_buffer")
 Array: TypeAlias = npt.NDArray[Any]
 
 
-class EpisodeCollection(Ranks, OnPolicyAlgorithm):
+class EpisodeCollection(DistributedTraining, OnPolicyAlgorithm):
     """Collects whole episodes, a fixed quota from each environment (DESIGN section 2)."""
 
     horizon: int | None
@@ -110,7 +110,7 @@ class EpisodeCollection(Ranks, OnPolicyAlgorithm):
         n_episodes: int,
     ) -> bool:
         """Simulate this rank's share of the episodes; only afterwards ranks add up timesteps."""
-        quotas = episodes_per_env(share(n_episodes), env.num_envs)
+        quotas = episodes_per_env(local_count(n_episodes), env.num_envs)
         before = self.num_timesteps
         completed = self._collect_episodes(env, callback, rollout_buffer, quotas)
         lengths = rollout_buffer.lengths
@@ -192,7 +192,7 @@ class EpisodeCollection(Ranks, OnPolicyAlgorithm):
                 last_end = n_steps
                 rollout_buffer.close_episode(end, self._terminal_value(end, new_obs, infos))
             self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]
-            if tracker.stalled and can_reset:
+            if tracker.needs_reset and can_reset:
                 self._reset_environments(env)
                 tracker.restart()
                 _require_finite("observation", self._last_obs, self.num_timesteps)
@@ -223,7 +223,7 @@ class EpisodeCollection(Ranks, OnPolicyAlgorithm):
                 self._reset_environments(target)
             callback = CallbackList([])
             callback.init_callback(self)
-            quotas = episodes_per_env(share(n_episodes), target.num_envs)
+            quotas = episodes_per_env(local_count(n_episodes), target.num_envs)
             self._collect_episodes(target, callback, buffer, quotas)
         finally:
             self.__dict__.update(state)

@@ -10,10 +10,10 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import Tensor
 
 from sb3_crpn.curvature import PairWeights
-from sb3_crpn.curvature.scores import EpisodeGroup
+from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.parameters import ActorParameters
-from sb3_crpn.sosp.implied import Operator, implied_covariance
+from sb3_crpn.sosp.model_covariance import Operator, model_covariance
 
 # The causal estimator at κ = 1: unbiased (DESIGN section 2)
 UNBIASED = PairWeights("causal", 1.0)
@@ -24,7 +24,7 @@ DENSE = 16
 
 
 @dataclass(frozen=True)
-class BlockSample:
+class BatchMeans:
     """K independent and identically distributed pairs (g_k, H_k) with means ∇J and ∇²J.
 
     Block k belongs to half k mod 2; K is even. Ĥ and ĝ are the means over all blocks.
@@ -37,17 +37,17 @@ class BlockSample:
         X ↦ (H_k x_k)_k, [K, d] to [K, d].
     half_products
         v ↦ the mean of H_k v over each half, [d] to [d].
-    implied_product
+    model_covariance_product
         v ↦ Bv, the covariance of g_k that the policy's probabilities imply, [d] to [d].
     """
 
     gradients: Tensor
     block_products: Operator
     half_products: tuple[Operator, Operator]
-    implied_product: Operator
+    model_covariance_product: Operator
 
     @classmethod
-    def from_matrices(cls, gradients: Tensor, hessians: Tensor, implied: Tensor) -> BlockSample:
+    def from_matrices(cls, gradients: Tensor, hessians: Tensor, implied: Tensor) -> BatchMeans:
         """Return the sample of known g_k [K, d], symmetric H_k [K, d, d] and B [d, d]."""
         even, odd = hessians[0::2].mean(0), hessians[1::2].mean(0)
         return cls(
@@ -66,30 +66,32 @@ class BlockSample:
         n_blocks: int,
         gamma: float,
         rng: np.random.Generator,
-    ) -> BlockSample:
+    ) -> BatchMeans:
         """Deal the episodes at random into ``n_blocks`` blocks of equally many.
 
         At random, because episodes come in the order in which they ended, which tells of their
         lengths.
         """
         batch = batch.take(rng.permutation(batch.n_episodes))
-        blocks = [EpisodeGroup(policy, actor, part, UNBIASED) for part in batch.split(n_blocks)]
-        even, odd = (EpisodeGroup(policy, actor, part, UNBIASED) for part in batch.split(2))
+        blocks = [
+            EpisodeDerivatives(policy, actor, part, UNBIASED) for part in batch.split(n_blocks)
+        ]
+        even, odd = (EpisodeDerivatives(policy, actor, part, UNBIASED) for part in batch.split(2))
         sample = cls(
             torch.stack([block.gradient() for block in blocks]),
             lambda vectors: torch.stack(
                 [block.hessian_product(x) for block, x in zip(blocks, vectors, strict=True)]
             ),
             (even.hessian_product, odd.hessian_product),
-            implied_covariance(policy, actor, batch, n_blocks, gamma),
+            model_covariance(policy, actor, batch, n_blocks, gamma),
         )
-        return sample.written_out() if sample.size <= DENSE else sample
+        return sample.to_dense() if sample.size <= DENSE else sample
 
-    def written_out(self) -> BlockSample:
+    def to_dense(self) -> BatchMeans:
         """Return the same sample with its Hessians as matrices."""
         identity = torch.eye(self.size, dtype=torch.float64, device=self.gradients.device)
         hessians = torch.stack([self.products(column) for column in identity], dim=2)
-        implied = torch.stack([self.implied_product(column) for column in identity], dim=1)
+        implied = torch.stack([self.model_covariance_product(column) for column in identity], dim=1)
         return self.from_matrices(
             self.gradients, 0.5 * (hessians + hessians.transpose(1, 2)), implied
         )

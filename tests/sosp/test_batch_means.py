@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from sb3_crpn.sosp.blocks import BlockSample
+from sb3_crpn.sosp.batch_means import BatchMeans
 from tests.policies import dense_hessian, flat_gradient, frozen_episodes, small_policy
 
 LENGTHS = (3, 1, 4, 2, 2, 3, 1, 2)
@@ -13,7 +13,7 @@ def sample_of(kind="discrete", n_blocks=4, net_arch=(3,)):
     policy, actor = small_policy(kind, net_arch=net_arch)
     batch = frozen_episodes(policy, LENGTHS)
     rng = np.random.default_rng(0)
-    sample = BlockSample.from_episodes(policy, actor, batch, n_blocks, GAMMA, rng)
+    sample = BatchMeans.from_episodes(policy, actor, batch, n_blocks, GAMMA, rng)
     return policy, actor, batch, sample
 
 
@@ -33,7 +33,7 @@ def test_blocks_are_the_undamped_causal_estimates_of_their_episodes(kind, net_ar
         expected = dense_hessian(policy, actor, block, "causal", 1.0)
         torch.testing.assert_close(products[k], expected @ X[k])
         log_prob = policy.get_distribution(block.observations).log_prob(block.actions)
-        gradient = flat_gradient(log_prob @ torch.from_numpy(block.weights), actor) / 2
+        gradient = flat_gradient(log_prob @ torch.from_numpy(block.cost_advantages), actor) / 2
         torch.testing.assert_close(sample.gradients[k], gradient)
 
 
@@ -53,8 +53,10 @@ def test_halves_and_moments_are_those_of_the_blocks():
 
 def test_writing_out_changes_nothing():
     sample = sample_of()[-1]
-    written = sample.written_out()
+    written = sample.to_dense()
     v, X = vectors(sample.size), vectors(4, sample.size)
     torch.testing.assert_close(written.block_products(X), sample.block_products(X))
     torch.testing.assert_close(written.mean_product(v), sample.mean_product(v))
-    torch.testing.assert_close(written.implied_product(v), sample.implied_product(v))
+    torch.testing.assert_close(
+        written.model_covariance_product(v), sample.model_covariance_product(v)
+    )

@@ -9,7 +9,7 @@ import torch
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
-from sb3_crpn.sosp.blocks import BlockSample
+from sb3_crpn.sosp.batch_means import BatchMeans
 from sb3_crpn.sosp.spectrum import FloatArray
 
 # Krylov steps on V̂, all directions tried, and the part of the interval's width that the last
@@ -18,7 +18,7 @@ _CHAIN, _MAX_DIRECTIONS, _TOLERANCE = 4, 20, 0.02
 
 
 def worst_curvature(
-    sample: BlockSample, leftmost: Tensor, random: Tensor, multiplier: float
+    sample: BatchMeans, leftmost: Tensor, random: Tensor, multiplier: float
 ) -> float:
     r"""Return a lower bound on min_v [vᵀĤv - τ √(vᵀV̂v)] over unit vectors, as tight as can be.
 
@@ -57,7 +57,7 @@ def worst_curvature(
 class _Space:
     """A growing orthonormal basis Q [d, k] with ĤQ and V̂Q."""
 
-    def __init__(self, sample: BlockSample) -> None:
+    def __init__(self, sample: BatchMeans) -> None:
         self._sample = sample
         self._columns: list[tuple[Tensor, Tensor, Tensor]] = []
 

@@ -5,12 +5,12 @@ import pytest
 import torch
 
 from sb3_crpn.curvature import PairWeights
-from sb3_crpn.curvature.scores import EpisodeGroup
-from sb3_crpn.episodes import EarlierRollouts
-from sb3_crpn.episodes import earlier as module
-from sb3_crpn.episodes.advantages import cost_weights, generalized_advantages
+from sb3_crpn.curvature.derivatives import EpisodeDerivatives
+from sb3_crpn.episodes import Replay
+from sb3_crpn.episodes import replay as module
+from sb3_crpn.episodes.advantages import cost_advantages, generalized_advantages
 from sb3_crpn.episodes.buffer import CHUNK
-from sb3_crpn.episodes.earlier import MAX_RATIO, MIN_EFFECTIVE_SIZE
+from sb3_crpn.episodes.replay import MAX_RATIO, MIN_EFFECTIVE_SIZE
 from tests.policies import frozen_episodes, small_policy
 
 GAMMA, GAE_LAMBDA = 0.9, 0.8
@@ -30,7 +30,7 @@ def rollout(policy, **arguments):
 
 
 def kept(*batches, size=3):
-    earlier = EarlierRollouts(size, GAMMA, GAE_LAMBDA)
+    earlier = Replay(size, GAMMA, GAE_LAMBDA)
     for batch in batches:
         earlier.append(batch)
     return earlier
@@ -60,8 +60,8 @@ def test_rollout_of_the_present_policy_has_the_weights_of_a_fresh_one(
     }
     (again,) = kept(batch).reweighted(policy, baseline=baseline, **options)
     np.testing.assert_allclose(
-        again.weights,
-        cost_weights(
+        again.cost_advantages,
+        cost_advantages(
             advantages if baseline else advantages + values, batch.lengths, gamma=GAMMA, **options
         ),
         rtol=1e-5,
@@ -86,7 +86,7 @@ def test_weights_follow_the_formula_after_the_policy_has_moved(kind, scale):
     advantages = generalized_advantages(
         batch.rewards, values, batch.terminal_values, batch.lengths, GAMMA, GAE_LAMBDA, traces
     )
-    np.testing.assert_allclose(again.weights, -np.minimum(MAX_RATIO, ratios) * advantages)
+    np.testing.assert_allclose(again.cost_advantages, -np.minimum(MAX_RATIO, ratios) * advantages)
     np.testing.assert_allclose(again.returns, values + traces * advantages)
 
 
@@ -118,7 +118,7 @@ def test_reused_bandit_gives_the_exact_gradient_and_curvature_of_the_present_pol
         terminal_values=np.zeros(1200),
     )
     (again,) = kept(batch).reweighted(policy, **RAW)
-    group = EpisodeGroup(policy, actor, again, PairWeights("causal", 1.0))
+    group = EpisodeDerivatives(policy, actor, again, PairWeights("causal", 1.0))
     bias = actor.vector.clone().requires_grad_()
 
     def cost(theta):

@@ -84,7 +84,7 @@ def _episode_totals(values: FloatArray, lengths: IntArray) -> FloatArray:
     return totals.repeat(lengths, axis=0)
 
 
-class EpisodeGroup:
+class EpisodeDerivatives:
     """The sums of DESIGN section 2 over one group of n episodes, as products with vectors.
 
     One forward pass is made and its graph kept, so that a product costs about two backward
@@ -123,7 +123,7 @@ class EpisodeGroup:
     @cached_property
     def _weighted_score(self) -> tuple[torch.Tensor, Sequence[torch.Tensor]]:
         """The weights A as a leaf tensor, and Σ A_i σ_i with its graph: linear in A."""
-        weights = self._log_prob.new_tensor(self.batch.weights).requires_grad_()
+        weights = self._log_prob.new_tensor(self.batch.cost_advantages).requires_grad_()
         score = torch.autograd.grad(
             self._log_prob,
             self._actor.tensors,
@@ -158,7 +158,7 @@ class EpisodeGroup:
         """
         u, curvature = self._along(vector)
         w = self._pair_weights.apply(
-            self.batch.weights, self.batch.lengths, u.to("cpu", torch.float64).numpy()
+            self.batch.cost_advantages, self.batch.lengths, u.to("cpu", torch.float64).numpy()
         )
         outer = torch.autograd.grad(
             self._log_prob,
@@ -169,7 +169,7 @@ class EpisodeGroup:
         )
         return (self._actor.flatten(outer) + curvature) / self.batch.n_episodes
 
-    def hessian_form(self, basis: torch.Tensor) -> torch.Tensor:
+    def quadratic_form(self, basis: torch.Tensor) -> torch.Tensor:
         """Return VᵀHV for V = ``basis`` [d, k], H as in :meth:`hessian_product`, [k, k].
 
         Half the backward passes of k products: with U = JV the first term is UᵀWU, which needs no
@@ -180,7 +180,7 @@ class EpisodeGroup:
             for columns in zip(*(self._along(vector) for vector in basis.T), strict=True)
         )
         U = u.to("cpu", torch.float64).numpy()
-        outer = U.T @ self._pair_weights.apply(self.batch.weights, self.batch.lengths, U)
+        outer = U.T @ self._pair_weights.apply(self.batch.cost_advantages, self.batch.lengths, U)
         return (torch.from_numpy(outer).to(basis) + basis.T @ curvature) / self.batch.n_episodes
 
     def _along(self, vector: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
