@@ -5,14 +5,36 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-import torch
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_crpn.algorithm import PolicyNewtonAlgorithm
 from sb3_crpn.algorithm.arguments import check_real, check_schedule, inherits_arguments
+from sb3_crpn.algorithm.solvers import SubproblemSolver
 from sb3_crpn.cubic import CubicStep
-from sb3_crpn.curvature import CurvatureEstimate, LocalModel
+from sb3_crpn.curvature import LocalModel
+from sb3_crpn.episodes import EpisodeBatch
+
+
+class GradientStep:
+    """s = -g/α, α = 1/η."""
+
+    def needs_matrix(self, dim: int) -> bool:
+        """Return False."""
+        return False
+
+    def solve(self, model: LocalModel, alpha: float) -> CubicStep:
+        """Minimise g·s + (α/2)‖s‖²."""
+        step = -model.gradient / alpha
+        return CubicStep(
+            step=step,
+            multiplier=alpha,
+            predicted_decrease=-0.5 * float(model.gradient @ step),
+            products=0,
+            residual=0.0,
+            certified=True,
+            status="gradient step",
+        )
 
 
 class REINFORCE(PolicyNewtonAlgorithm):
@@ -36,7 +58,7 @@ class REINFORCE(PolicyNewtonAlgorithm):
     ) -> None:
         self.actor_learning_rate = actor_learning_rate
         super().__init__(
-            *args, target_kl=None, metric="euclidean", hessian_shrinkage=None, **arguments
+            *args, target_kl=None, metric="euclidean", hessian_shrinkage=0.0, **arguments
         )
 
     def _setup_model(self) -> None:
@@ -46,26 +68,5 @@ class REINFORCE(PolicyNewtonAlgorithm):
         rate = FloatSchedule(self.actor_learning_rate)
         self.alpha_schedule = lambda progress: 1.0 / rate(progress)
 
-    def _local_model(self, estimate: CurvatureEstimate) -> LocalModel:
-        return LocalModel(
-            gradient=estimate.gradient,
-            hessian=None,
-            product=torch.zeros_like,
-            basis=None,
-            shrinkage=0.0,
-            lambda_min=float("nan"),
-            products=0,
-        )
-
-    def _solve(self, model: LocalModel, alpha: float) -> CubicStep:
-        """Return s = -g/α with α = 1/η."""
-        step = -model.gradient / alpha
-        return CubicStep(
-            step=step,
-            multiplier=alpha,
-            predicted_decrease=-0.5 * float(model.gradient @ step),
-            products=0,
-            residual=0.0,
-            certified=True,
-            status="gradient step",
-        )
+    def _update_solver(self, batch: EpisodeBatch) -> SubproblemSolver:
+        return GradientStep()

@@ -18,9 +18,10 @@ from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_crpn.algorithm.arguments import check_arguments, check_sb3_arguments
 from sb3_crpn.algorithm.critic import fuse
+from sb3_crpn.algorithm.kl_control import KLControl
 from sb3_crpn.algorithm.random_state import RandomState
 from sb3_crpn.algorithm.update import PolicyNewtonUpdate
-from sb3_crpn.curvature.derivatives import HessianEstimator
+from sb3_crpn.curvature import HessianEstimator, Metric, Shrinkage
 from sb3_crpn.distributed import rank
 from sb3_crpn.episodes import (
     DictEpisodeRolloutBuffer,
@@ -70,15 +71,17 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         standard deviation of the λ-returns falls below a fifth of its recent maximum, steps are
         shorter in proportion. ``None``: α follows its schedule.
     metric
-        "fisher": M = F + εI; "euclidean": M = I, the paper's.
+        "fisher": M = F + εI; "euclidean": M = I, the paper's; or a
+        :class:`~sb3_crpn.curvature.Metric`.
     fisher_damping
-        ε > 0 of the Fisher metric.
+        ε > 0 of "fisher".
     hessian_estimator
-        "causal", or the paper's "trajectory".
+        "causal", or the paper's "trajectory"; or a :class:`~sb3_crpn.curvature.HessianEstimator`.
     hessian_lambda
-        κ in [0, 1], the decay of the causal estimator's cross-time terms: 1 is unbiased.
+        κ in [0, 1], the decay of the cross-time terms of "causal": 1 is unbiased.
     hessian_shrinkage
-        ω in [0, 1]; "auto": the James-Stein factor from two groups of episodes; ``None``: 1.
+        ω in [0, 1]; "auto": the James-Stein factor from two groups of episodes; ``None``: 1; or a
+        :class:`~sb3_crpn.curvature.Shrinkage`.
     krylov_dim
         Dimension of the Krylov space that steps are sought in; ``None``: 10 with ``target_kl`` or
         the Fisher metric, else as large as the solver's certificate needs.
@@ -139,11 +142,11 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         n_reused_rollouts: int = 3,
         alpha: float | Schedule = 1.0,
         target_kl: float | None = 0.02,
-        metric: Literal["euclidean", "fisher"] = "fisher",
+        metric: str | Metric = "fisher",
         fisher_damping: float = 0.1,
-        hessian_estimator: HessianEstimator = "causal",
+        hessian_estimator: str | HessianEstimator = "causal",
         hessian_lambda: float = 0.9,
-        hessian_shrinkage: float | Literal["auto"] | None = "auto",
+        hessian_shrinkage: float | Literal["auto"] | Shrinkage | None = "auto",
         krylov_dim: int | None = None,
         gamma: float = 0.99,
         gae_lambda: float = 0.95,
@@ -212,7 +215,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         self.target_kl = target_kl
         self.metric = metric
         self.fisher_damping = fisher_damping
-        self.hessian_estimator: HessianEstimator = hessian_estimator
+        self.hessian_estimator = hessian_estimator
         self.hessian_lambda = hessian_lambda
         self.hessian_shrinkage = hessian_shrinkage
         self.krylov_dim = krylov_dim
@@ -224,6 +227,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         self.batch_size = batch_size
         self.n_critic_updates = n_critic_updates
         self.max_batch_timesteps = max_batch_timesteps
+        self.kl_control = KLControl()
         if _init_setup_model:
             self._setup_model()
 
@@ -249,7 +253,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         return ActorParameters.reachable(self.policy, log_prob)
 
     def _excluded_save_params(self) -> list[str]:
-        own = ["actor", "alpha_schedule", "replay", "_collecting", "_statistics"]
+        own = ["actor", "alpha_schedule", "replay", "last_update", "_collecting", "_statistics"]
         return [*super()._excluded_save_params(), *own]
 
     def learn(
@@ -263,6 +267,7 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
     ) -> Self:
         """Train for at least ``total_timesteps``, as SB3's algorithms do."""
         self.replay.clear()  # the environment may be another one
+        self.last_update = None
         return super().learn(
             total_timesteps=total_timesteps,
             callback=callback,

@@ -13,6 +13,7 @@ import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import get_device
 
+from sb3_crpn.curvature import HESSIAN_ESTIMATORS, METRICS, SHRINKAGES
 from sb3_crpn.episodes import EpisodeRolloutBuffer
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -89,9 +90,9 @@ def check_arguments(model: Any) -> None:
         "n_reused_rollouts": at_least_zero,
         "alpha": partial(check_schedule, check=positive),
         "target_kl": partial(check_optional, check=positive),
-        "metric": partial(check_choice, allowed=("euclidean", "fisher")),
+        "metric": METRICS.check,
         "fisher_damping": positive,
-        "hessian_estimator": partial(check_choice, allowed=("causal", "trajectory")),
+        "hessian_estimator": HESSIAN_ESTIMATORS.check,
         "hessian_lambda": fraction,
         "hessian_shrinkage": _check_shrinkage,
         "krylov_dim": partial(check_optional, check=at_least_one),
@@ -158,11 +159,11 @@ def _check_seed(name: str, value: object) -> None:
 
 
 def _check_shrinkage(name: str, value: object) -> None:
-    if value is not None and value != "auto":
+    if value is not None and not SHRINKAGES.accepts(value):
         try:
             check_real(name, value, 0.0, 1.0)
         except ValueError as error:
-            raise ValueError(f'{error}, or "auto", or None') from None
+            raise ValueError(f"{error}, or None, or {SHRINKAGES.allowed}") from None
 
 
 def _check_buffer_class(name: str, value: object) -> None:

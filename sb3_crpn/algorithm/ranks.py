@@ -42,6 +42,10 @@ class DistributedTraining(BaseAlgorithm):
         )
         return total_timesteps, callback if world_size() == 1 else RankZeroCallback(callback)
 
+    def _share_policy(self) -> None:
+        """Give every rank the policy of rank 0, bit for bit."""
+        broadcast_state(self.policy)
+
     def _share_statistics(self) -> None:
         """Add up what the ranks' ``VecNormalize`` have seen since they last agreed."""
         if self._statistics is not None and world_size() > 1:

@@ -16,8 +16,10 @@ from sb3_crpn.distributed import (
     all_sum,
     broadcast,
     gather_counts,
+    local_count,
     mean_and_variance,
     rank,
+    world_size,
 )
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
@@ -153,6 +155,15 @@ class EpisodeBatch:
     def preceding_episodes(self) -> int:
         """The number of episodes on the ranks before this one; every rank must ask."""
         return sum(gather_counts(self.n_episodes)[: rank()])
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether this process holds the whole batch: a run on one process."""
+        return world_size() == 1
+
+    def share(self, n_episodes: int) -> int:
+        """Return this rank's share of ``n_episodes`` that are dealt out evenly."""
+        return local_count(n_episodes)
 
     def total(self, part: torch.Tensor) -> torch.Tensor:
         """Return the sum of a quantity whose ``part`` this rank's episodes make up."""
