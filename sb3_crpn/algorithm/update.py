@@ -265,7 +265,7 @@ def _step_statistics(
         "multiplier": cubic.multiplier,
         "predicted_decrease": cubic.predicted_decrease,
         "step_norm": float(step.step.norm()) if accepted else 0.0,
-        "kl": step.kl if accepted else 0.0,
+        "kl_divergence": step.kl if accepted else 0.0,
         "surrogate_change": change,
         "policy_objective": -mean_cost - change * batch.total_episodes / batch.total_steps,
         "accepted": accepted,

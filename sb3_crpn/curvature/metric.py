@@ -68,7 +68,7 @@ class Fisher:
     def whitening(self, form: torch.Tensor) -> torch.Tensor:
         """Return (Λ + ε)^(-½)Qᵀ from VᵀFV = QΛQᵀ; a negative eigenvalue is rounding."""
         eigenvalues, vectors = torch.linalg.eigh(form)
-        scale: torch.Tensor = (eigenvalues.clamp(min=0.0) + self.damping) ** -0.5
+        scale = (eigenvalues.clamp(min=0.0) + self.damping).pow(-0.5)
         return scale[:, None] * vectors.T
 
 
