@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import io
+import os
+import pathlib
+from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 import torch
 from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import (
     ActorCriticCnnPolicy,
     ActorCriticPolicy,
@@ -17,22 +23,33 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_crpn.algorithm.arguments import check_arguments, check_sb3_arguments
+from sb3_crpn.algorithm.checkpoint import (
+    load_random_state,
+    read_random_state,
+    replaced_in_one_go,
+)
 from sb3_crpn.algorithm.critic import fuse
-from sb3_crpn.algorithm.random_state import RandomState
+from sb3_crpn.algorithm.distributed_training import DistributedTraining
+from sb3_crpn.algorithm.rollouts import warn_of_endless_episodes
 from sb3_crpn.algorithm.update import PolicyNewtonUpdate
 from sb3_crpn.curvature.derivatives import HessianEstimator
-from sb3_crpn.distributed import rank
+from sb3_crpn.distributed import rank, rank_seed
 from sb3_crpn.episodes import (
     DictEpisodeRolloutBuffer,
     EpisodeRolloutBuffer,
+    EpisodeTracker,
     Replay,
+    Tracker,
 )
+from sb3_crpn.episodes.collector import all_finite
+from sb3_crpn.episodes.running_moments import RunningMoments
 from sb3_crpn.parameters import ActorParameters
+from sb3_crpn.policy import find_actor, find_actor_anywhere, to_tensor
 
 Self = TypeVar("Self", bound="PolicyNewtonAlgorithm")
 
 
-class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
+class PolicyNewtonAlgorithm(PolicyNewtonUpdate):
     """Base of the cubic-regularised policy Newton algorithms.
 
     Each update minimises the cubic model of the cost J(θ) = -E[Σ_h γ^h r_h],
@@ -121,6 +138,11 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
     Maniyar, Prashanth L.A., Mondal, Bhatnagar, A Cubic-regularized Policy Newton Algorithm for
     Reinforcement Learning, AISTATS 2024.
     """
+
+    _actor: ActorParameters | None = None
+    _actor_among: Sequence[tuple[torch.Tensor, bool]] = ()
+    _rng: np.random.Generator = np.random.default_rng()
+    _saved_random_state: dict[str, Any] | None = None
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": ActorCriticPolicy,
@@ -238,19 +260,41 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
         fuse(self.policy.optimizer)
         self.alpha_schedule = FloatSchedule(self.alpha)
         self.replay = Replay(self.n_reused_rollouts, self.gamma, self.gae_lambda)
-        self.actor = self._find_actor()
+        self.tracker: Tracker = EpisodeTracker()
+        if self.env is not None and self.tracker.whole_episodes and self.horizon is None:
+            warn_of_endless_episodes(self.env)
 
-    def _find_actor(self) -> ActorParameters:
-        """Select the parameters that log π depends on, by gradient reachability."""
-        self.policy.set_training_mode(False)
-        zeros = _zero_observation(self.observation_space)
-        distribution = self.policy.get_distribution(self.policy.obs_to_tensor(zeros)[0])
-        log_prob = distribution.log_prob(distribution.mode().detach())
-        return ActorParameters.reachable(self.policy, log_prob)
+    @property
+    def actor(self) -> ActorParameters:
+        """The parameters θ that log π depends on, looked for again where the policy has others.
+
+        The policy, or layers of it, may be replaced, frozen or unfrozen at any time.
+        """
+        present = [(tensor, tensor.requires_grad) for tensor in self.policy.parameters()]
+        if self._actor is None or not _same(present, self._actor_among):
+            self.policy.set_training_mode(False)
+            if self._last_obs is None:
+                self._actor = find_actor_anywhere(self.policy, self.observation_space)
+            else:
+                self._actor = find_actor(self.policy, to_tensor(self.policy, self._last_obs))
+            self._actor_among = present
+        return self._actor
 
     def _excluded_save_params(self) -> list[str]:
-        own = ["actor", "alpha_schedule", "replay", "_collecting", "_statistics"]
-        return [*super()._excluded_save_params(), *own]
+        found = ["_actor", "_actor_among"]
+        derived = ["alpha_schedule", "replay", "tracker", "ranks", "_collecting"]
+        return [*super()._excluded_save_params(), *found, *derived]
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """Seed Python, NumPy, PyTorch, the environments and the model's own generator.
+
+        Every rank but the first seeds them with a hash of ``seed`` and its number.
+        """
+        self._seed(None if seed is None else rank_seed(seed))
+
+    def _seed(self, seed: int | None) -> None:
+        super().set_random_seed(seed)
+        self._rng = np.random.default_rng(seed)
 
     def learn(
         self: Self,
@@ -263,18 +307,77 @@ class PolicyNewtonAlgorithm(RandomState, PolicyNewtonUpdate):
     ) -> Self:
         """Train for at least ``total_timesteps``, as SB3's algorithms do."""
         self.replay.clear()  # the environment may be another one
-        return super().learn(
-            total_timesteps=total_timesteps,
-            callback=callback,
-            log_interval=log_interval,
-            tb_log_name=tb_log_name or type(self).__name__,
-            reset_num_timesteps=reset_num_timesteps,
-            progress_bar=progress_bar,
+        with torch.enable_grad():
+            return super().learn(
+                total_timesteps=total_timesteps,
+                callback=callback,
+                log_interval=log_interval,
+                tb_log_name=tb_log_name or type(self).__name__,
+                reset_num_timesteps=reset_num_timesteps,
+                progress_bar=progress_bar,
+            )
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        state, self._saved_random_state = self._saved_random_state, None
+        if self.seed is None or reset_num_timesteps:
+            state = None
+        if rank() > 0:
+            callback, progress_bar = None, False
+            self.set_logger(Logger(folder=None, output_formats=[]))
+            if state is not None and self.seed is not None:
+                self._seed(rank_seed(self.seed, self.num_timesteps))
+        normalizer = self.get_vec_normalize_env()
+        self.ranks = DistributedTraining(self.policy, normalizer)
+        moments = None if normalizer is None else RunningMoments(normalizer)
+        before = None if moments is None else moments.snapshot()
+        total_timesteps, callback = super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
+        if moments is not None and before is not None and not all_finite(self._last_obs):
+            moments.restore(before)
+        if state is not None and rank() == 0:
+            load_random_state(state, self.device)
+            self._rng = state["model"]
+        return total_timesteps, self.ranks.callback(callback)
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """Save all attributes, parameters and random states in a zip file; rank 0 alone does.
+
+        A file of that name is replaced at the end, in one go: whatever happens in between leaves
+        it intact. ``learn(reset_num_timesteps=False)`` of a loaded model with a seed restores the
+        random states, so that it goes on as if it had not stopped; loading for evaluation touches
+        nothing. The environments' own generators are theirs to save.
+        """
+        if rank() > 0:
+            return
+        self._saved_random_state = {**read_random_state(self.device), "model": self._rng}
+        try:
+            if not isinstance(path, str | os.PathLike):
+                super().save(path, exclude, include)
+                return
+            file = path if pathlib.Path(path).suffix else f"{path}.zip"  # as SB3 does
+            with replaced_in_one_go(file) as stream:
+                super().save(stream, exclude, include)
+        finally:
+            self._saved_random_state = None
 
 
-def _zero_observation(space: spaces.Space[Any]) -> Any:
-    """Return an observation of zeros."""
-    if isinstance(space, spaces.Dict):
-        return {key: _zero_observation(subspace) for key, subspace in space.spaces.items()}
-    return np.zeros(space.shape or (), dtype=space.dtype)
+def _same(
+    present: Sequence[tuple[torch.Tensor, bool]], earlier: Sequence[tuple[torch.Tensor, bool]]
+) -> bool:
+    return len(present) == len(earlier) and all(
+        now is then and trainable == was_trainable
+        for (now, trainable), (then, was_trainable) in zip(present, earlier, strict=True)
+    )

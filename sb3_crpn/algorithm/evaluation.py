@@ -10,10 +10,11 @@ import torch
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_crpn.curvature.derivatives import mean_divergence, policy_distribution
+from sb3_crpn.curvature.derivatives import policy_distribution
 from sb3_crpn.distributed import all_sum, broadcast
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.parameters import ActorParameters
+from sb3_crpn.policy import mean_divergence
 
 # target_kl counts as met within 10 per cent (DESIGN section 5)
 KL_TOLERANCE = 0.1

@@ -12,9 +12,9 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_crpn.algorithm.arguments import check_integer, check_real
-from sb3_crpn.algorithm.collection import EpisodeCollection
 from sb3_crpn.algorithm.critic import fit_critic
 from sb3_crpn.algorithm.evaluation import CandidateEvaluator
+from sb3_crpn.algorithm.rollouts import RolloutAlgorithm
 from sb3_crpn.algorithm.step import PolicyStep, take_step
 from sb3_crpn.cubic import CubicStep
 from sb3_crpn.curvature import (
@@ -34,6 +34,7 @@ from sb3_crpn.episodes import (
     concatenate,
 )
 from sb3_crpn.parameters import ActorParameters
+from sb3_crpn.policy import unchanged_on_error
 
 # Dimension of the Krylov space when the step's length is set by the KL divergence: the number of
 # conjugate-gradient iterations of Schulman et al., Trust region policy optimization, ICML 2015,
@@ -48,10 +49,9 @@ SCALE_DECAY = 0.99
 MIN_KL_SCALE = 1e-2
 
 
-class PolicyNewtonUpdate(EpisodeCollection):
+class PolicyNewtonUpdate(RolloutAlgorithm):
     """The update of DESIGN section 5; the subclass brings the arguments and the solver."""
 
-    actor: ActorParameters
     replay: Replay
     n_episodes: int | Schedule | None
     n_hessian_episodes: int | Schedule | None
@@ -72,8 +72,17 @@ class PolicyNewtonUpdate(EpisodeCollection):
     _fitted_alpha: float | None = None  # the last α that met target_kl
     _return_scale = 0.0  # the largest standard deviation of the returns, fading
 
+    @property
+    def actor(self) -> ActorParameters:
+        """The parameters θ that log π depends on."""
+        raise NotImplementedError
+
     def train(self) -> None:
-        """Update the policy from the episodes just collected (DESIGN section 5)."""
+        """Update the policy from the rollout just collected (DESIGN section 5), or not at all."""
+        with unchanged_on_error(self.policy):
+            self._update()
+
+    def _update(self) -> None:
         self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
         batch = self._episode_batch(self.rollout_buffer)
@@ -104,7 +113,7 @@ class PolicyNewtonUpdate(EpisodeCollection):
         """
         check_integer("n_episodes", n_episodes, 1)
         broadcast_state(self.policy)
-        batch = self._episode_batch(self._collect_fresh(n_episodes, env))
+        batch = self._episode_batch(self._collect_evaluation_episodes(n_episodes, env))
         return self._estimate_from(batch, batch)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
@@ -277,7 +286,7 @@ class PolicyNewtonUpdate(EpisodeCollection):
             "hessian_shrinkage": model.shrinkage,
             "n_episodes": sum(gather_counts(batch.n_episodes)),
             "n_reused_rollouts": n_earlier,
-            "used_timesteps_fraction": self.rollout_buffer.used_fraction,
+            "used_timesteps_fraction": self._used_fraction,
             "explained_variance": _explained_variance(batch),
         }
         if target_kl is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,34 +9,20 @@ from typing import Literal
 
 import numpy as np
 import torch
-from stable_baselines3.common.distributions import (
-    Distribution,
-    MultiCategoricalDistribution,
-    kl_divergence,
-)
+from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_crpn.episodes.batch import EpisodeBatch, FloatArray, IntArray, episode_scan, episode_starts
+from sb3_crpn.arrays import FloatArray, IntArray
+from sb3_crpn.episodes.batch import EpisodeBatch, episode_scan, episode_starts
 from sb3_crpn.parameters import ActorParameters
+from sb3_crpn.policy import action_distribution, mean_divergence
 
 HessianEstimator = Literal["causal", "trajectory"]
 
 
 def policy_distribution(policy: ActorCriticPolicy, batch: EpisodeBatch) -> Distribution:
-    """Return π(·|s_i;θ) over the batch; a copy, because SB3's policies reuse one object."""
-    return copy.copy(policy.get_distribution(batch.observations))
-
-
-def mean_divergence(old: Distribution, new: Distribution) -> torch.Tensor:
-    """Return the mean of KL(old ‖ new) over the states and the action's k components, a scalar.
-
-    The mean, not the sum, over components is what sb3-contrib's TRPO bounds: a step of one and
-    the same divergence changes each component as much whether there are one or twenty.
-    """
-    divergence = kl_divergence(old, new)  # [T], or [T, k] where SB3 keeps the components apart
-    if isinstance(old, MultiCategoricalDistribution):  # which SB3 sums
-        divergence = divergence / len(old.action_dims)
-    return divergence.mean()
+    """Return π(·|s_i;θ) over the batch."""
+    return action_distribution(policy, batch.observations)
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,10 @@ from typing import Literal
 import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 
+from sb3_crpn.arrays import IntArray
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives, PairWeights
-from sb3_crpn.distributed import all_sum, gather_counts, rank
-from sb3_crpn.episodes.batch import EpisodeBatch, IntArray, episode_chunks, round_robin_split
+from sb3_crpn.distributed import all_sum
+from sb3_crpn.episodes.batch import EpisodeBatch, episode_chunks
 from sb3_crpn.parameters import ActorParameters
 
 # Groups whose disagreement measures the noise: two give an unbiased estimate of it, and more of
@@ -56,10 +57,7 @@ class EpisodeFolds:
         pair_weights: PairWeights,
         max_steps: int | None,
     ) -> None:
-        counts = gather_counts(batch.n_episodes)
-        dealt = round_robin_split(
-            batch.n_episodes, min(N_GROUPS, sum(counts)), first=sum(counts[: rank()])
-        )
+        dealt = batch.folds(N_GROUPS)
         own = [[len(episodes), batch.lengths[episodes].sum()] for episodes in dealt]
         self.n_episodes, self.n_steps = all_sum(torch.tensor(own, dtype=torch.float64)).T
         self._zero = torch.zeros(len(actor), dtype=torch.float64, device=actor.device)

@@ -16,8 +16,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_crpn.algorithm import PolicyNewtonAlgorithm
 from sb3_crpn.algorithm.arguments import check_choice, check_integer, check_optional, check_real
-from sb3_crpn.episodes.batch import EpisodeBatch, map_observations
-from sb3_crpn.parameters import ActorParameters
+from sb3_crpn.episodes.batch import map_observations
+from sb3_crpn.policy import find_actor
 from sb3_crpn.sosp.batch_means import BatchMeans
 from sb3_crpn.sosp.episodes import collect_episodes, preserve_state, with_baseline
 from sb3_crpn.sosp.inference import bernstein_intervals, bootstrap_intervals
@@ -111,8 +111,9 @@ def certify_sosp(
         batch = collect_episodes(policy, target, n_episodes, gamma=model.gamma, horizon=horizon)
         if interval == "bootstrap":
             batch = with_baseline(policy, batch, model.gamma)
+        first = map_observations(batch.observations, lambda tensor: tensor[:1])
         sample = BatchMeans.from_episodes(
-            policy, _actor(policy, batch), batch, n_blocks, model.gamma, rng
+            policy, find_actor(policy, first), batch, n_blocks, model.gamma, rng
         )
         generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
         spectrum = lanczos_spectrum(
@@ -186,13 +187,6 @@ def _in_rollout(model: OnPolicyAlgorithm) -> bool:
         return model._collecting
     started = model._last_obs is not None and model.num_timesteps > 0
     return started and not model.rollout_buffer.full
-
-
-def _actor(policy: ActorCriticPolicy, batch: EpisodeBatch) -> ActorParameters:
-    """Select the parameters that log π depends on, by gradient reachability."""
-    first = map_observations(batch.observations, lambda tensor: tensor[:1])
-    log_prob = policy.get_distribution(first).log_prob(batch.actions[:1])
-    return ActorParameters.reachable(policy, log_prob)
 
 
 def _default_rho(model: OnPolicyAlgorithm) -> float:
