@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
@@ -17,9 +16,10 @@ from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_crpn.algorithm.ranks import DistributedTraining
+from sb3_crpn.algorithm.settings import PolicyNewtonSettings
+from sb3_crpn.arrays import Array, IntArray
 from sb3_crpn.distributed import all_sum, local_count, world_size
 from sb3_crpn.episodes import EpisodeRolloutBuffer, EpisodeTracker, episodes_per_env, steps_to_quota
-from sb3_crpn.episodes.batch import IntArray
 from sb3_crpn.episodes.tracker import EpisodeEnd
 
 # An environment is taken to be endless when no episode ends within so many steps: nearly twice
@@ -29,16 +29,10 @@ ENDLESS = 50_000
 # What a rollout outside training must leave as it was
 _COUNTERS = ("num_timesteps", "ep_info_buffer", "ep_success_buffer")
 
-Array: TypeAlias = npt.NDArray[Any]
 
-
-class EpisodeCollection(DistributedTraining, OnPolicyAlgorithm):
+class EpisodeCollection(DistributedTraining, OnPolicyAlgorithm, PolicyNewtonSettings):
     """Collects whole episodes, a fixed quota from each environment (DESIGN section 2)."""
 
-    horizon: int | None
-    baseline: bool
-    n_reused_rollouts: int
-    bootstrap_truncated: bool
     _mean_episode_length: float | None = None  # of the last rollout
     _collecting: bool = False
     _batch_sizes: tuple[int | None, int | None] = (None, None)

@@ -12,9 +12,10 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 from torch.nn import functional
 
+from sb3_crpn.arrays import FloatArray
 from sb3_crpn.distributed import all_max, all_sum, gather_counts, mean_and_variance, world_size
 from sb3_crpn.episodes import EpisodeBatch, Observations
-from sb3_crpn.episodes.batch import FloatArray, map_observations
+from sb3_crpn.episodes.batch import map_observations
 from sb3_crpn.parameters import ActorParameters
 
 

@@ -12,8 +12,8 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_crpn.arrays import FloatArray
 from sb3_crpn.distributed import all_sum, broadcast, broadcast_state, local_mode, rank, world_size
-from sb3_crpn.episodes.batch import FloatArray
 
 
 class DistributedTraining(BaseAlgorithm):

@@ -17,7 +17,8 @@ from stable_baselines3.common.distributions import (
 )
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_crpn.episodes.batch import EpisodeBatch, FloatArray, IntArray, episode_scan, episode_starts
+from sb3_crpn.arrays import FloatArray, IntArray
+from sb3_crpn.episodes.batch import EpisodeBatch, episode_scan, episode_starts
 from sb3_crpn.parameters import ActorParameters
 
 HessianEstimator = Literal["causal", "trajectory"]

@@ -10,9 +10,10 @@ from typing import Literal
 import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 
+from sb3_crpn.arrays import IntArray
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives, PairWeights
 from sb3_crpn.distributed import all_sum, gather_counts, rank
-from sb3_crpn.episodes.batch import EpisodeBatch, IntArray, episode_chunks, round_robin_split
+from sb3_crpn.episodes.batch import EpisodeBatch, episode_chunks, round_robin_split
 from sb3_crpn.parameters import ActorParameters
 
 # Groups whose disagreement measures the noise: two give an unbiased estimate of it, and more of

@@ -7,14 +7,9 @@ import math
 import numpy as np
 from scipy.linalg import solve_banded
 
+from sb3_crpn.arrays import FloatArray, IntArray
 from sb3_crpn.distributed import mean_and_variance
-from sb3_crpn.episodes.batch import (
-    FloatArray,
-    IntArray,
-    episode_scan,
-    episode_starts,
-    episode_time,
-)
+from sb3_crpn.episodes.batch import episode_scan, episode_starts, episode_time
 
 
 def generalized_advantages(

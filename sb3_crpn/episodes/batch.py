@@ -7,10 +7,9 @@ from dataclasses import dataclass, fields
 from typing import Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 import torch
-from scipy.signal import lfilter
 
+from sb3_crpn.arrays import FloatArray, IntArray
 from sb3_crpn.distributed import (
     all_max,
     all_sum,
@@ -20,8 +19,6 @@ from sb3_crpn.distributed import (
     rank,
 )
 
-FloatArray: TypeAlias = npt.NDArray[np.float64]
-IntArray: TypeAlias = npt.NDArray[np.int64]
 Observations: TypeAlias = torch.Tensor | dict[str, torch.Tensor]
 
 
@@ -85,6 +82,8 @@ def episode_scan(
         return values
     if reverse:
         return episode_scan(values[::-1], factor, lengths[::-1])[::-1]
+    from scipy.signal import lfilter  # here: the import takes a second
+
     filtered: FloatArray = lfilter([1.0], [1.0, -factor], values, axis=0)
     inherited = np.zeros((len(lengths), *filtered.shape[1:]))
     inherited[1:] = filtered[episode_starts(lengths)[1:] - 1]

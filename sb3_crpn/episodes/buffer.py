@@ -6,16 +6,16 @@ from collections.abc import Generator
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import DictRolloutBufferSamples, RolloutBufferSamples
 
+from sb3_crpn.arrays import Array, IntArray
 from sb3_crpn.distributed import all_sum
 from sb3_crpn.episodes.advantages import cost_advantages, generalized_advantages
-from sb3_crpn.episodes.batch import EpisodeBatch, IntArray, Observations, episode_time
+from sb3_crpn.episodes.batch import EpisodeBatch, Observations, episode_time
 from sb3_crpn.episodes.tracker import EpisodeEnd
 
 # Steps in one forward pass that evaluates: enough to be efficient, of bounded memory
@@ -177,6 +177,6 @@ class DictEpisodeRolloutBuffer(EpisodeRolloutBuffer, DictRolloutBuffer):
     """:class:`EpisodeRolloutBuffer` for dict observations."""
 
 
-def _doubled(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def _doubled(array: Array) -> Array:
     """Return ``array`` followed by as many rows again."""
     return np.concatenate([array, np.zeros_like(array)])

@@ -9,9 +9,10 @@ import numpy as np
 import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 
+from sb3_crpn.arrays import FloatArray
 from sb3_crpn.distributed import all_sum
 from sb3_crpn.episodes.advantages import cost_advantages, generalized_advantages
-from sb3_crpn.episodes.batch import EpisodeBatch, FloatArray
+from sb3_crpn.episodes.batch import EpisodeBatch
 from sb3_crpn.episodes.buffer import CHUNK
 
 # ρ̄, where importance ratios are truncated (Ionides, Truncated importance sampling, 2008): bounds

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sb3_crpn.episodes.batch import IntArray
+from sb3_crpn.arrays import IntArray
 
 
 def episodes_per_env(n_episodes: int, n_envs: int) -> IntArray:

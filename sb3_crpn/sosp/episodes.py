@@ -14,7 +14,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_crpn.algorithm.collection import ENDLESS, Array
+from sb3_crpn.algorithm.collection import ENDLESS
+from sb3_crpn.arrays import Array
 from sb3_crpn.episodes import (
     DictEpisodeRolloutBuffer,
     EpisodeBatch,
