@@ -6,11 +6,11 @@ from functools import partial
 from typing import Any
 
 import torch
+from sb3_crpn.algorithm.arguments import check_real, check_schedule, inherits_arguments
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_crpn.algorithm import PolicyNewtonAlgorithm
-from sb3_crpn.algorithm.arguments import check_real, check_schedule, inherits_arguments
 from sb3_crpn.cubic import CubicStep
 from sb3_crpn.curvature import CurvatureEstimate, LocalModel
 

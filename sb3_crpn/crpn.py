@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 from sb3_crpn.algorithm import PolicyNewtonAlgorithm
-from sb3_crpn.algorithm.arguments import check_choice, inherits_arguments
+from sb3_crpn.algorithm.declaration import configured, setting
+from sb3_crpn.checks import choice
 from sb3_crpn.cubic import CubicStep, solve_dense, solve_krylov
 from sb3_crpn.curvature import LocalModel
 
@@ -15,28 +16,19 @@ DENSE_DIM = 64
 KRYLOV_TOL = 1e-5
 
 
+@configured
 class CRPN(PolicyNewtonAlgorithm):
     """Cubic-Regularised Policy Newton: every step is a global minimiser of the cubic model.
 
-    Parameters
-    ----------
-    solver
-        "dense": the whole Hessian, d products, by eigendecomposition; "krylov": products only;
-        "auto": dense up to d = 64.
-    **arguments
-        Those of :class:`~sb3_crpn.algorithm.PolicyNewtonAlgorithm`.
+    {parameters}
     """
 
-    @inherits_arguments(PolicyNewtonAlgorithm)
-    def __init__(
-        self, *args: Any, solver: Literal["auto", "dense", "krylov"] = "auto", **arguments: Any
-    ) -> None:
-        self.solver = solver
-        super().__init__(*args, **arguments)
-
-    def _setup_model(self) -> None:
-        check_choice("solver", self.solver, ("auto", "dense", "krylov"))
-        super()._setup_model()
+    solver: Literal["auto", "dense", "krylov"] = setting(
+        choice("auto", "dense", "krylov"),
+        '"dense": the whole Hessian, d products, by eigendecomposition; "krylov": products only; '
+        '"auto": dense up to d = 64.',
+        "auto",
+    )
 
     def _prefers_dense(self) -> bool:
         return self.solver == "dense" or (self.solver == "auto" and len(self.actor) <= DENSE_DIM)

@@ -13,30 +13,39 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_FUNCTION_LINES = 60
 
 # From bottom to top; a module imports from those before it alone
+GROUND = {"checks", "arrays"}
 LAYERS = {
-    "cubic": set(),
+    "checks": set(),
+    "arrays": set(),
+    "cubic": GROUND,
     "parameters": set(),
-    "distributed": set(),
-    "vec_env": set(),
-    "episodes": {"distributed"},
-    "curvature": {"cubic", "parameters", "distributed", "episodes"},
-    "algorithm": {"cubic", "parameters", "distributed", "vec_env", "episodes", "curvature"},
-    "crpn": {"cubic", "curvature", "algorithm"},
-    "acrpn": {"cubic", "distributed", "curvature", "algorithm"},
-    "sosp": {"cubic", "parameters", "distributed", "episodes", "curvature", "algorithm"},
-    "theory": set(),
-    "callbacks": {"algorithm"},
+    "distributed": {"arrays"},
+    "vec_env": {"arrays"},
+    "policy": {"arrays", "parameters"},
+    "episodes": {"arrays", "distributed", "policy"},
+    "curvature": {"arrays", "cubic", "parameters", "policy", "distributed", "episodes"},
+    "algorithm": GROUND
+    | {"cubic", "parameters", "policy", "distributed", "vec_env", "episodes", "curvature"},
+    "crpn": {"checks", "cubic", "curvature", "algorithm"},
+    "acrpn": {"checks", "cubic", "distributed", "curvature", "algorithm"},
+    "sosp": GROUND
+    | {"cubic", "parameters", "policy", "distributed", "episodes", "curvature", "algorithm"},
+    "theory": {"checks"},
+    "callbacks": {"checks", "algorithm"},
     "__init__": {"crpn", "acrpn", "sosp", "theory", "callbacks"},
     "zoo": {"distributed", "crpn", "acrpn", "__init__"},
 }
 ARRAYS = {"numpy", "scipy", "torch"}
 SB3 = {"stable_baselines3", "gymnasium"}
 THIRD_PARTY = {
+    "checks": set(),
+    "arrays": {"numpy", "torch"},
     "cubic": ARRAYS,
     "parameters": {"torch"},
     "distributed": {"numpy", "torch"},
     "sosp": {*ARRAYS, *SB3, "matplotlib"},
     "theory": set(),
+    "algorithm": {*ARRAYS, *SB3, "typing_extensions"},
     "zoo": {*ARRAYS, *SB3, "rl_zoo3", "optuna"},
 }
 
@@ -93,6 +102,8 @@ def test_imports_point_down(path):
 @pytest.mark.parametrize(
     ("layer", "source"),
     [
+        ("checks", "import numpy as np"),
+        ("arrays", "from sb3_crpn.checks import COUNT"),
         ("cubic", "import stable_baselines3"),
         ("cubic", "from sb3_crpn.episodes import EpisodeBatch"),
         ("parameters", "import numpy as np"),

@@ -12,6 +12,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_crpn.algorithm.distributed_training import DistributedTraining
+from sb3_crpn.algorithm.settings import PolicyNewtonSettings
 from sb3_crpn.distributed import local_count, world_size
 from sb3_crpn.episodes import (
     Collector,
@@ -28,13 +29,9 @@ from sb3_crpn.episodes import (
 MIN_EPISODE_LIMIT = 1000
 
 
-class RolloutAlgorithm(OnPolicyAlgorithm):
+class RolloutAlgorithm(OnPolicyAlgorithm, PolicyNewtonSettings):
     """An on-policy algorithm that learns from the segments of a tracker (DESIGN section 2)."""
 
-    horizon: int | None
-    baseline: bool
-    n_reused_rollouts: int
-    bootstrap_truncated: bool
     tracker: Tracker
     ranks: DistributedTraining
     _mean_episode_length: float | None = None  # of the last rollout

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
 
 import numpy as np
 import torch
@@ -11,11 +10,12 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_crpn.algorithm.arguments import check_integer, check_real
 from sb3_crpn.algorithm.critic import fit_critic
 from sb3_crpn.algorithm.evaluation import CandidateEvaluator
 from sb3_crpn.algorithm.rollouts import RolloutAlgorithm
+from sb3_crpn.algorithm.settings import CheckedSchedule
 from sb3_crpn.algorithm.step import PolicyStep, take_step
+from sb3_crpn.checks import COUNT, NONE, real, requires
 from sb3_crpn.cubic import CubicStep
 from sb3_crpn.curvature import (
     CurvatureEstimate,
@@ -25,7 +25,6 @@ from sb3_crpn.curvature import (
     full_model,
     projected_model,
 )
-from sb3_crpn.curvature.derivatives import HessianEstimator
 from sb3_crpn.distributed import broadcast_state, gather_counts, local_count, mean_and_variance
 from sb3_crpn.episodes import (
     EpisodeBatch,
@@ -48,26 +47,14 @@ SCALE_DECAY = 0.99
 # The shortest, a hundredth: its KL divergence can still be told from 0 in single precision
 MIN_KL_SCALE = 1e-2
 
+_VEC_ENV = requires("a VecEnv", lambda value: isinstance(value, VecEnv))
+
 
 class PolicyNewtonUpdate(RolloutAlgorithm):
     """The update of DESIGN section 5; the subclass brings the arguments and the solver."""
 
     replay: Replay
-    n_episodes: int | Schedule | None
-    n_hessian_episodes: int | Schedule | None
     alpha_schedule: Schedule
-    target_kl: float | None
-    metric: Literal["euclidean", "fisher"]
-    fisher_damping: float
-    hessian_estimator: HessianEstimator
-    hessian_lambda: float
-    hessian_shrinkage: float | Literal["auto"] | None
-    krylov_dim: int | None
-    max_batch_timesteps: int | None
-    normalize_advantage: bool
-    discount_visitation: bool
-    batch_size: int
-    n_critic_updates: int
     _rng: np.random.Generator
     _fitted_alpha: float | None = None  # the last α that met target_kl
     _return_scale = 0.0  # the largest standard deviation of the returns, fading
@@ -111,7 +98,8 @@ class PolicyNewtonUpdate(RolloutAlgorithm):
         env
             Where to simulate; ``None``: the training environment.
         """
-        check_integer("n_episodes", n_episodes, 1)
+        n_episodes = COUNT("estimate_curvature: n_episodes", n_episodes)
+        env = (_VEC_ENV | NONE)("estimate_curvature: env", env)
         broadcast_state(self.policy)
         batch = self._episode_batch(self._collect_evaluation_episodes(n_episodes, env))
         return self._estimate_from(batch, batch)
@@ -123,14 +111,17 @@ class PolicyNewtonUpdate(RolloutAlgorithm):
 
     def _scheduled_episodes(self) -> tuple[int | None, int | None]:
         progress = self._current_progress_remaining
-        numbers: list[int | None] = []
-        for name in ("n_episodes", "n_hessian_episodes"):
-            value = getattr(self, name)
-            if callable(value):
-                value = value(progress)
-                check_real(f"{name}({progress:g})", value, 1.0)
-            numbers.append(None if value is None else round(value))
-        return numbers[0], numbers[1]
+
+        def number(name: str, value: int | Schedule | None) -> int | None:
+            if value is None:
+                return None
+            name = f"{type(self).__name__}: {name}"
+            return round(CheckedSchedule(name, value, real(1.0))(progress))
+
+        return (
+            number("n_episodes", self.n_episodes),
+            number("n_hessian_episodes", self.n_hessian_episodes),
+        )
 
     def _episode_batch(self, buffer: RolloutBuffer) -> EpisodeBatch:
         assert isinstance(buffer, EpisodeRolloutBuffer)  # by _setup_model
@@ -212,10 +203,10 @@ class PolicyNewtonUpdate(RolloutAlgorithm):
         ``VecNormalize``. Once a task is solved all episodes are alike and σ_k falls by orders of
         magnitude: what is left to the advantages is the critic's error, which a step that is
         fitted to a target follows as far as it followed the returns. This one's length is in
-        proportion to σ_k.
+        proportion to σ_k. Without ``scale_target_kl``, δ_k = δ.
         """
-        if self.target_kl is None:
-            return None
+        if self.target_kl is None or not self.scale_target_kl:
+            return self.target_kl
         deviation = self._reward_unit() * math.sqrt(mean_and_variance(batch.returns)[1])
         if not math.isfinite(deviation):  # nor is the step, which is rejected
             return self.target_kl

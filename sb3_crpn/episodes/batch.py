@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from scipy.signal import lfilter
 
 from sb3_crpn.arrays import FloatArray, IntArray, Observations
 from sb3_crpn.distributed import (
@@ -107,6 +106,8 @@ def episode_scan(
         return values
     if reverse:
         return episode_scan(values[::-1], factor, lengths[::-1])[::-1]
+    from scipy.signal import lfilter  # here: the import takes a second
+
     filtered: FloatArray = lfilter([1.0], [1.0, -factor], values, axis=0)
     inherited = np.zeros((len(lengths), *filtered.shape[1:]))
     inherited[1:] = filtered[episode_starts(lengths)[1:] - 1]
