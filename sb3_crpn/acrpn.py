@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from stable_baselines3.common.buffers import RolloutBuffer
@@ -12,10 +11,9 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_crpn.algorithm import PolicyNewtonAlgorithm
 from sb3_crpn.algorithm.declaration import configured, setting
+from sb3_crpn.algorithm.solvers import ApproximateSolver, SubproblemSolver
 from sb3_crpn.checks import COUNT, FLAG, NONE, POSITIVE, choice
-from sb3_crpn.cubic import CubicStep, cubic_finalsolver, cubic_subsolver
-from sb3_crpn.curvature import CurvatureEstimate, LocalModel
-from sb3_crpn.distributed import broadcast
+from sb3_crpn.episodes import EpisodeBatch
 
 
 @configured
@@ -48,11 +46,6 @@ class ACRPN(PolicyNewtonAlgorithm):
         "End training when the predicted decrease says ε-SOSP, as the paper's Algorithm 2 does.",
         False,
     )
-    _at_sosp = False
-
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        self._at_sosp = False
-        return super()._setup_learn(*args, **kwargs)
 
     def collect_rollouts(
         self,
@@ -62,41 +55,16 @@ class ACRPN(PolicyNewtonAlgorithm):
         n_rollout_steps: int,
     ) -> bool:
         """Collect whole episodes, unless the last update found an ε-SOSP and is to be the last."""
-        if self.stop_at_sosp and bool(broadcast(torch.tensor(self._at_sosp))):
+        if self.stop_at_sosp and self.last_update is not None and self.last_update.at_sosp:
             return False
         return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
 
-    def _local_model(self, estimate: CurvatureEstimate) -> LocalModel:
-        # one perturbation an update, whatever α is tried
-        self._perturbation_seed = int(broadcast(torch.tensor(self._rng.integers(2**31))))
-        return super()._local_model(estimate)
-
-    def _solve(self, model: LocalModel, alpha: float) -> CubicStep:
-        lipschitz = self._lipschitz(model)
-        cubic = cubic_subsolver(
-            model.gradient,
-            model.product,
-            alpha,
-            gradient_lipschitz=lipschitz,
-            epsilon=self.sosp_epsilon,
-            max_steps=self.subsolver_steps,
-            seed=self._perturbation_seed,
+    def _update_solver(self, batch: EpisodeBatch) -> SubproblemSolver:
+        seed = batch.agreed(torch.tensor(self._rng.integers(2**31)))
+        lipschitz = self.gradient_lipschitz
+        return ApproximateSolver(
+            None if isinstance(lipschitz, str) else lipschitz,
+            self.sosp_epsilon,
+            self.subsolver_steps,
+            int(seed),
         )
-        enough = math.sqrt(self.sosp_epsilon**3 / alpha) / 100.0
-        self._at_sosp = cubic.predicted_decrease <= enough
-        if not self._at_sosp:
-            return cubic
-        return cubic_finalsolver(
-            model.gradient,
-            model.product,
-            alpha,
-            gradient_lipschitz=lipschitz,
-            epsilon=self.sosp_epsilon,
-            max_steps=self.subsolver_steps,
-        )
-
-    def _lipschitz(self, model: LocalModel) -> float | None:
-        if self.gradient_lipschitz != "auto":
-            return self.gradient_lipschitz
-        # None: the subsolver estimates it by products
-        return None if model.hessian is None else float(torch.linalg.matrix_norm(model.hessian, 2))

@@ -111,9 +111,9 @@ class RandomIterateCallback(BaseCallback):
             self.parameters = _copy(self.model.policy)
 
     def _weight(self) -> float:
-        """Return α_k of the last update, whose log has not been dumped yet."""
-        if isinstance(self.model, PolicyNewtonAlgorithm):
-            return float(self.logger.name_to_value["train/alpha"])
+        """Return α_k of the last update."""
+        if isinstance(self.model, PolicyNewtonAlgorithm) and self.model.last_update is not None:
+            return self.model.last_update.alpha
         return 1.0
 
 

@@ -6,6 +6,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
+from sb3_crpn.curvature import Causal, Trajectory
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.episodes.batch import episode_starts
 from sb3_crpn.parameters import ActorParameters
@@ -101,6 +102,14 @@ def log_hessians(policy, actor, batch):
         score = flat_gradient(log_prob, actor, create_graph=True)
         hessians.append(torch.stack([flat_gradient(entry, actor) for entry in score]))
     return torch.stack(hessians)
+
+
+ESTIMATORS = [("trajectory", 1.0), *(("causal", decay) for decay in (0.0, 0.5, 0.9, 1.0))]
+
+
+def estimator_of(name, decay=1.0):
+    """The Hessian estimator of DESIGN section 2."""
+    return Trajectory() if name == "trajectory" else Causal(decay)
 
 
 def pair_matrix(estimator, decay, weights):

@@ -30,6 +30,7 @@ from sb3_crpn.algorithm.checkpoint import (
 from sb3_crpn.algorithm.critic import fuse
 from sb3_crpn.algorithm.declaration import check_setting, check_settings, configured
 from sb3_crpn.algorithm.distributed_training import DistributedTraining
+from sb3_crpn.algorithm.kl_control import KLControl
 from sb3_crpn.algorithm.rollouts import warn_of_endless_episodes
 from sb3_crpn.algorithm.settings import LEARNING_RATE, CheckedSchedule
 from sb3_crpn.algorithm.update import PolicyNewtonUpdate
@@ -92,6 +93,7 @@ class PolicyNewtonAlgorithm(PolicyNewtonUpdate):
         self._actor: ActorParameters | None = None
         self._actor_among: Sequence[tuple[torch.Tensor, bool]] = ()
         self._rng = np.random.default_rng()
+        self.kl_control = KLControl()
         self._saved_random_state: dict[str, Any] | None = None
         check = partial(check_setting, self)
         check_settings(self)
@@ -167,7 +169,7 @@ class PolicyNewtonAlgorithm(PolicyNewtonUpdate):
         return self._actor
 
     def _excluded_save_params(self) -> list[str]:
-        found = ["_actor", "_actor_among"]
+        found = ["_actor", "_actor_among", "last_update"]
         derived = ["alpha_schedule", "lr_schedule", "replay", "tracker", "ranks", "_collecting"]
         return [*super()._excluded_save_params(), *found, *derived]
 
@@ -193,6 +195,7 @@ class PolicyNewtonAlgorithm(PolicyNewtonUpdate):
     ) -> Self:
         """Train for at least ``total_timesteps``, as SB3's algorithms do."""
         self.replay.clear()  # the environment may be another one
+        self.last_update = None
         with torch.enable_grad():
             return super().learn(
                 total_timesteps=total_timesteps,

@@ -47,6 +47,11 @@ class DistributedTraining:
         return totals
 
 
+def share_policy(policy: BasePolicy) -> None:
+    """Give every rank the policy of rank 0, bit for bit."""
+    broadcast_state(policy)
+
+
 class RankZeroCallback(CallbackList):
     """A callback that finds its rank alone, so that it may do all that it may on one process."""
 

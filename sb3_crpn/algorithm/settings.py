@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from dataclasses import KW_ONLY, InitVar, dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch
 from stable_baselines3.common.buffers import RolloutBuffer
@@ -26,12 +26,18 @@ from sb3_crpn.checks import (
     SEED,
     VERBOSE,
     Check,
-    choice,
     integer,
     real,
     requires,
 )
-from sb3_crpn.curvature.derivatives import HessianEstimator
+from sb3_crpn.curvature import (
+    HESSIAN_ESTIMATORS,
+    METRICS,
+    SHRINKAGES,
+    HessianEstimator,
+    Metric,
+    Shrinkage,
+)
 from sb3_crpn.episodes import EpisodeRolloutBuffer
 
 
@@ -160,23 +166,28 @@ class PolicyNewtonSettings:
         "every step is fitted to ``target_kl`` itself.",
         True,
     )
-    metric: Literal["euclidean", "fisher"] = setting(
-        choice("euclidean", "fisher"),
-        '"fisher": M = F + εI; "euclidean": M = I, the paper\'s.',
+    metric: str | Metric = setting(
+        METRICS.check,
+        '"fisher": M = F + εI; "euclidean": M = I, the paper\'s; or a '
+        ":class:`~sb3_crpn.curvature.Metric`.",
         "fisher",
     )
-    fisher_damping: float = setting(POSITIVE, "ε > 0 of the Fisher metric.", 0.1)
-    hessian_estimator: HessianEstimator = setting(
-        choice("causal", "trajectory"), '"causal", or the paper\'s "trajectory".', "causal"
+    fisher_damping: float = setting(POSITIVE, 'ε > 0 of "fisher".', 0.1)
+    hessian_estimator: str | HessianEstimator = setting(
+        HESSIAN_ESTIMATORS.check,
+        '"causal", or the paper\'s "trajectory"; or a '
+        ":class:`~sb3_crpn.curvature.HessianEstimator`.",
+        "causal",
     )
     hessian_lambda: float = setting(
         FRACTION,
-        "κ in [0, 1], the decay of the causal estimator's cross-time terms: 1 is unbiased.",
+        'κ in [0, 1], the decay of the cross-time terms of "causal": 1 is unbiased.',
         0.9,
     )
-    hessian_shrinkage: float | Literal["auto"] | None = setting(
-        FRACTION | choice("auto") | NONE,
-        'ω in [0, 1]; "auto": the James-Stein factor from two groups of episodes; ``None``: 1.',
+    hessian_shrinkage: float | str | Shrinkage | None = setting(
+        FRACTION | SHRINKAGES.check | NONE,
+        'ω in [0, 1]; "auto": the James-Stein factor from two folds of trajectories; ``None``: 1; '
+        "or a :class:`~sb3_crpn.curvature.Shrinkage`.",
         "auto",
     )
     krylov_dim: int | None = setting(

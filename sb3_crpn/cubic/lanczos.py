@@ -46,11 +46,11 @@ class KrylovSpace:
         self.ends.append(self._end(start, float(torch.linalg.vector_norm(start))))
         return len(self.chains) - 1
 
-    def extend(self, chain: int) -> None:
-        """Add the end of ``chain`` to the basis, at the cost of one product."""
+    def extend(self, chain: int) -> Tensor | None:
+        """Add the end q of ``chain`` to the basis and return Aq, one product; None at its end."""
         end = self.ends[chain]
         if end is None:
-            return
+            return None
         q = self._outside(end / torch.linalg.vector_norm(end))
         self._append(q / torch.linalg.vector_norm(q))
         self.chains[chain].append(self.size - 1)
@@ -62,6 +62,7 @@ class KrylovSpace:
         self.projected[-1, :] = self.projected[:, -1] = column
         self.ends[chain] = product
         self.ends = [None if e is None else self._end(e, self.norm) for e in self.ends]
+        return product
 
     def _append(self, row: Tensor) -> None:
         if self.size == len(self._rows):
@@ -80,11 +81,10 @@ class KrylovSpace:
         return vector - self.basis.T @ (self.basis @ vector)
 
 
-def krylov_basis(matvec: Operator, start: ArrayLike, dim: int) -> Tensor:
+def krylov_basis(matvec: Operator, start: ArrayLike, dim: int) -> tuple[Tensor, Tensor]:
     """Orthonormal basis of the Krylov space span{b, Ab, …, A^{dim-1}b}, A symmetric.
 
-    Lanczos with full reorthogonalisation. ``matvec`` is called exactly once per column, with
-    that column and in order, the last one included: a caller that records the products has AQ.
+    Lanczos with full reorthogonalisation, at one product a column.
 
     Parameters
     ----------
@@ -97,8 +97,8 @@ def krylov_basis(matvec: Operator, start: ArrayLike, dim: int) -> Tensor:
 
     Returns
     -------
-    Tensor
-        Q, [d, k], float64, k ≤ min(d, dim); fewer where the space is invariant before.
+    tuple[Tensor, Tensor]
+        Q and AQ, [d, k], float64, k ≤ min(d, dim); fewer where the space is invariant before.
 
     Raises
     ------
@@ -109,6 +109,11 @@ def krylov_basis(matvec: Operator, start: ArrayLike, dim: int) -> Tensor:
     size = min(vector.numel(), COUNT("krylov_basis: dim", dim))
     space = KrylovSpace(CountedOperator("krylov_basis: matvec", matvec), vector, _BREAKDOWN)
     chain = space.open(vector)
+    images: list[Tensor] = []
     for _ in range(size):
-        space.extend(chain)
-    return space.basis.T.contiguous()
+        image = space.extend(chain)
+        if image is None:
+            break
+        images.append(image)
+    basis = space.basis.T.contiguous()
+    return basis, torch.stack(images, dim=1) if images else basis.clone()

@@ -44,6 +44,9 @@ class CubicStep:
         How the solver ended, for people.
     lambda_min
         Leftmost (Ritz) value of H, relative to M, that the solver saw; NaN if it saw none.
+    at_sosp
+        Whether the model allows so small a decrease that the origin is an ε-second-order stationary
+        point: the early termination of Maniyar et al., Algorithm 2. Other solvers leave it False.
     """
 
     step: Tensor
@@ -54,6 +57,7 @@ class CubicStep:
     certified: bool
     status: str
     lambda_min: float = math.nan
+    at_sosp: bool = False
 
 
 class CountedOperator:

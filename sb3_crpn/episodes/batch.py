@@ -15,8 +15,10 @@ from sb3_crpn.distributed import (
     all_sum,
     broadcast,
     gather_counts,
+    local_count,
     mean_and_variance,
     rank,
+    world_size,
 )
 
 
@@ -201,6 +203,15 @@ class EpisodeBatch:
         counts = gather_counts(self.n_trajectories)
         n_folds = max(1, min(n_folds, sum(counts)))
         return round_robin_split(self.trajectories, n_folds, first=sum(counts[: rank()]))
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether this process holds the whole batch: a run on one process."""
+        return world_size() == 1
+
+    def share(self, n_episodes: int) -> int:
+        """Return this rank's share of ``n_episodes`` that are dealt out evenly."""
+        return local_count(n_episodes)
 
     def total(self, part: torch.Tensor) -> torch.Tensor:
         """Return the sum of a quantity whose ``part`` this rank's episodes make up."""

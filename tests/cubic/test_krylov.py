@@ -171,7 +171,8 @@ def test_bad_input(change, message):
 def test_basis_is_orthonormal_and_spans_the_krylov_space(dim, spectrum):
     problem = large(eigenvalues=SPECTRA.get(spectrum))
     hvp = problem.hvp()
-    Q = krylov_basis(hvp, problem.gradient, dim)
+    Q, AQ = krylov_basis(hvp, problem.gradient, dim)
+    torch.testing.assert_close(AQ, hvp.hessian @ Q)
     k = Q.shape[1]
     assert Q.shape == (problem.dim, k)
     assert k <= dim
@@ -186,10 +187,15 @@ def test_basis_is_orthonormal_and_spans_the_krylov_space(dim, spectrum):
 
 def test_basis_stops_at_breakdown():
     problem = large(eigenvalues=SPECTRA["clusters"])
-    assert krylov_basis(problem.hvp(), problem.gradient, 50).shape == (300, 3)
-    assert krylov_basis(lambda v: 0 * v, np.ones(5), 3).shape == (5, 1)
-    assert krylov_basis(lambda v: v, np.ones(1), 3).shape == (1, 1)
-    assert krylov_basis(lambda v: v, np.zeros(4), 3).shape == (4, 0)
+    for operator, start, dim, shape in [
+        (problem.hvp(), problem.gradient, 50, (300, 3)),
+        (lambda v: 0 * v, np.ones(5), 3, (5, 1)),
+        (lambda v: v, np.ones(1), 3, (1, 1)),
+        (lambda v: v, np.ones(2), 10**15, (2, 1)),  # ends at once
+        (lambda v: v, np.zeros(4), 3, (4, 0)),
+    ]:
+        Q, AQ = krylov_basis(operator, start, dim)
+        assert Q.shape == AQ.shape == shape
 
 
 def test_basis_checks_its_input():

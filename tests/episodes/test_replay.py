@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sb3_crpn.curvature import PairWeights
+from sb3_crpn.curvature import Causal
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from sb3_crpn.episodes import Replay
 from sb3_crpn.episodes import batch as episode_batch
@@ -122,7 +122,7 @@ def test_reused_bandit_gives_the_exact_gradient_and_curvature_of_the_present_pol
         terminal_values=np.zeros(1200),
     )
     (again,) = kept(batch).reweighted(policy, **RAW)
-    group = EpisodeDerivatives(policy, actor, again, PairWeights("causal", 1.0))
+    group = EpisodeDerivatives(policy, actor, again, Causal(1.0))
     bias = actor.vector.clone().requires_grad_()
 
     def cost(theta):

@@ -3,12 +3,11 @@ import pytest
 import torch
 from torch.func import jacrev
 
-from sb3_crpn.curvature import PairWeights
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.theory import Constants, ScoreBounds, softmax_linear
 from tests.mdp import TabularMDP, random_mdp, random_parameters, tabular_crpn
-from tests.policies import small_policy
+from tests.policies import estimator_of, small_policy
 
 NAMES = ["cost_bound", "M_g", "M_H", "L_H", "G_g", "G_H", "M_1", "M_2"]
 
@@ -79,7 +78,7 @@ def episode_estimates(policy, actor, batch, estimator="trajectory"):
     gradients, hessians = [], []
     for episode in range(batch.n_episodes):
         group = EpisodeDerivatives(
-            policy, actor, batch.take(np.array([episode])), PairWeights(estimator)
+            policy, actor, batch.take(np.array([episode])), estimator_of(estimator)
         )
         gradients.append(group.gradient())
         hessians.append(torch.stack([group.hessian_product(v) for v in eye]))
