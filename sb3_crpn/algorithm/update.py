@@ -61,6 +61,8 @@ class PolicyNewtonUpdate(EpisodeCollection):
 
     def train(self) -> None:
         """Update the policy from the episodes just collected (DESIGN section 5)."""
+        # a bad value of the schedule ends the update before anything changes
+        alpha = self.alpha_schedule(self._current_progress_remaining)
         self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
         batch = self._episode_batch(self.rollout_buffer)
@@ -68,7 +70,7 @@ class PolicyNewtonUpdate(EpisodeCollection):
         estimate = self._estimate(batch, earlier)
         model = self._local_model(estimate)
         target_kl = self._scaled_target_kl(batch)
-        step = self._take_step(estimate.gradient_batch, model, target_kl)
+        step = self._take_step(estimate.gradient_batch, model, alpha, target_kl)
         value_loss = self._fit_critic(batch, earlier)
         if step.trial.finite:  # what spoilt one step would spoil the next ones
             self.replay.append(batch)
@@ -214,10 +216,9 @@ class PolicyNewtonUpdate(EpisodeCollection):
         return math.sqrt(float(normalizer.ret_rms.var) + normalizer.epsilon)
 
     def _take_step(
-        self, batch: EpisodeBatch, model: LocalModel, target_kl: float | None
+        self, batch: EpisodeBatch, model: LocalModel, alpha: float, target_kl: float | None
     ) -> PolicyStep:
         """Choose α, move the actor, and move it back if the step is no good."""
-        alpha = self.alpha_schedule(self._current_progress_remaining)
         if target_kl is not None and self._fitted_alpha is not None:
             alpha = self._fitted_alpha
         step = take_step(
