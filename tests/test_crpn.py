@@ -231,6 +231,8 @@ def test_steps_are_shorter_where_returns_hardly_differ(algorithm):
         last = target(100.0)
     assert last == 0.02  # that outlier is forgotten
     assert make(algorithm, target_kl=None)._scaled_target_kl(batch) is None
+    model = make(algorithm, target_kl=0.02, scale_target_kl=False)
+    assert [target(scale) for scale in (100.0, 1e-9, 1e9)] == [0.02] * 3
 
 
 @pytest.mark.parametrize("norm_reward", [False, True])
