@@ -1,6 +1,7 @@
 """The layers of DESIGN section 6: what each module may import."""
 
 import ast
+import subprocess
 import sys
 from pathlib import Path
 
@@ -80,6 +81,16 @@ def violations(layer, names):
                 yield name
         elif root not in sys.stdlib_module_names and root not in third_party:
             yield name
+
+
+def test_importing_the_package_leaves_slow_modules_out():
+    """They take a second, and few calls need them."""
+    code = "import sys, sb3_crpn; print(*sys.modules)"
+    loaded = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert "sb3_crpn.crpn" in loaded.stdout.split()
+    assert {"scipy.signal", "scipy.stats", "rl_zoo3"}.isdisjoint(loaded.stdout.split())
 
 
 def package_of(path):

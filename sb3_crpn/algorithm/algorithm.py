@@ -102,8 +102,11 @@ class PolicyNewtonAlgorithm(PolicyNewtonUpdate):
             raise not_allowed(
                 f"{type(self).__name__}: env", env, "an environment or a registered id"
             )
+        if check("policy", policy) not in self.policy_aliases and isinstance(policy, str):
+            names = ", ".join(f'"{name}"' for name in self.policy_aliases)
+            raise not_allowed(f"{type(self).__name__}: policy", policy, f"{names} or a class")
         super().__init__(
-            check("policy", policy),
+            policy,
             env,  # type: ignore[arg-type] # None where a file is loaded
             learning_rate=self.learning_rate,
             n_steps=self.n_steps,
