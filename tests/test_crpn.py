@@ -212,6 +212,23 @@ def test_earlier_rollouts_of_the_same_call_join_an_update(algorithm, monkeypatch
     assert batches.sizes[0] == (3, 2)
 
 
+@both
+def test_target_kl_is_scaled_unless_the_user_objects(algorithm):
+    batch = frozen_episodes(small_policy("discrete")[0], lengths=(3, 1, 4, 2))
+    differences = np.linspace(-1.0, 1.0, batch.n_steps)
+
+    def targets(**arguments):
+        model = make(algorithm, target_kl=0.02, **arguments)
+        return [
+            model._update_target_kl(dataclasses.replace(batch, returns=scale * differences))
+            for scale in (100.0, 2.0, 1e-9)
+        ]
+
+    expected = [0.02, 0.02 * (2.0 / (0.2 * 100.0 * 0.99)) ** 2, 0.02 * 1e-4]
+    assert targets() == pytest.approx(expected)
+    assert targets(scale_target_kl=False) == [0.02] * 3
+
+
 @pytest.mark.parametrize("norm_reward", [False, True])
 def test_returns_are_compared_in_the_units_of_the_environment(norm_reward):
     env = VecNormalize(several(2, dim=2), norm_reward=norm_reward)

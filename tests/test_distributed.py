@@ -39,8 +39,8 @@ from sb3_crpn.distributed import (
     rank,
     rank_seed,
     world_size,
-    zoo_options,
 )
+from sb3_crpn.zoo import zoo_options
 from tests.envs import Drift, Faulty
 from tests.policies import frozen_episodes, small_policy
 from tests.ranks import run_ranks

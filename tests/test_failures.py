@@ -12,8 +12,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_crpn import ACRPN, PAPER
-from sb3_crpn.algorithm import collection
 from sb3_crpn.algorithm.evaluation import CandidateEvaluator
+from sb3_crpn.episodes import collector
 from tests.envs import Drift, Faulty, FaultyReset, Rewards, Sampler
 from tests.training import TrainLog, all_finite, both, make, same, several, tensors
 
@@ -181,7 +181,7 @@ def test_killed_worker(tmp_path):
 
 @both
 def test_endless_episodes(algorithm, monkeypatch):
-    monkeypatch.setattr(collection, "ENDLESS", 40)
+    monkeypatch.setattr(collector, "ENDLESS", 40)
     endless = Drift(bound=INF, limit=INF)
     model = make(algorithm, endless)
     earlier = tensors(model)
@@ -198,7 +198,7 @@ def test_endless_episodes(algorithm, monkeypatch):
 
 @both
 def test_one_endless_environment_among_others(algorithm, monkeypatch):
-    monkeypatch.setattr(collection, "ENDLESS", 40)
+    monkeypatch.setattr(collector, "ENDLESS", 40)
     env = DummyVecEnv([Drift, lambda: Drift(bound=INF, limit=INF)])
     with pytest.raises(ValueError, match="horizon"):
         make(algorithm, env).learn(200)

@@ -12,9 +12,11 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 from torch.nn import functional
 
-from sb3_crpn.episodes import EpisodeBatch, Observations
+from sb3_crpn.arrays import Observations
+from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.episodes.batch import map_observations
 from sb3_crpn.parameters import ActorParameters
+from sb3_crpn.policy import state_values
 
 
 def fit_critic(
@@ -115,7 +117,7 @@ def _backward(
     """Leave the gradient of the mean squared error in the parameters, and return the error."""
     if not len(returns):
         return 0.0
-    loss = functional.mse_loss(policy.predict_values(observations).flatten(), returns)
+    loss = functional.mse_loss(state_values(policy, observations), returns)
     torch.autograd.backward(loss)
     return loss.item()
 

@@ -9,9 +9,10 @@ import torch
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_crpn.curvature.derivatives import mean_divergence, policy_distribution
+from sb3_crpn.curvature.derivatives import policy_distribution
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.parameters import ActorParameters
+from sb3_crpn.policy import mean_divergence
 
 
 @dataclass(frozen=True)

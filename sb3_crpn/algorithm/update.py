@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,14 +11,16 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_crpn.algorithm.arguments import check_integer, check_real
-from sb3_crpn.algorithm.collection import EpisodeCollection
 from sb3_crpn.algorithm.critic import fit_critic
+from sb3_crpn.algorithm.distributed_training import share_policy
 from sb3_crpn.algorithm.evaluation import CandidateEvaluator
 from sb3_crpn.algorithm.kl_control import KLControl
+from sb3_crpn.algorithm.rollouts import RolloutAlgorithm
+from sb3_crpn.algorithm.settings import CheckedSchedule
 from sb3_crpn.algorithm.solvers import SubproblemSolver
 from sb3_crpn.algorithm.statistics import UpdateStats
 from sb3_crpn.algorithm.step import PolicyStep, take_step
+from sb3_crpn.checks import COUNT, NONE, real, requires
 from sb3_crpn.curvature import (
     HESSIAN_ESTIMATORS,
     METRICS,
@@ -26,10 +28,7 @@ from sb3_crpn.curvature import (
     CurvatureEstimate,
     Euclidean,
     FullModel,
-    HessianEstimator,
     LocalModel,
-    Metric,
-    Shrinkage,
     estimate_curvature,
     resolve_shrinkage,
     subspace_model,
@@ -41,40 +40,36 @@ from sb3_crpn.episodes import (
     concatenate,
 )
 from sb3_crpn.parameters import ActorParameters
+from sb3_crpn.policy import unchanged_on_error
 
 # Dimension of the Krylov space when the step's length is set by the KL divergence: the number of
 # conjugate-gradient iterations of Schulman et al., Trust region policy optimization, ICML 2015,
 # appendix C, whose step H = 0 then reproduces.
 KRYLOV_DIM = 10
 
+_VEC_ENV = requires("a VecEnv", lambda value: isinstance(value, VecEnv))
 
-class PolicyNewtonUpdate(EpisodeCollection):
+
+class PolicyNewtonUpdate(RolloutAlgorithm):
     """The update of DESIGN section 5; the subclass brings the arguments and the solver."""
 
-    actor: ActorParameters
     replay: Replay
-    n_episodes: int | Schedule | None
-    n_hessian_episodes: int | Schedule | None
-    alpha_schedule: Schedule
-    target_kl: float | None
-    scale_target_kl: bool = True
-    metric: str | Metric
-    fisher_damping: float
-    hessian_estimator: str | HessianEstimator
-    hessian_lambda: float
-    hessian_shrinkage: float | Literal["auto"] | Shrinkage | None
-    krylov_dim: int | None
-    max_batch_timesteps: int | None
-    normalize_advantage: bool
-    discount_visitation: bool
-    batch_size: int
-    n_critic_updates: int
-    _rng: np.random.Generator
+    alpha_schedule: CheckedSchedule
     kl_control: KLControl
     last_update: UpdateStats | None = None  # of this call of learn
+    _rng: np.random.Generator
+
+    @property
+    def actor(self) -> ActorParameters:
+        """The parameters θ that log π depends on."""
+        raise NotImplementedError
 
     def train(self) -> None:
-        """Update the policy from the episodes just collected (DESIGN section 5)."""
+        """Update the policy from the rollout just collected (DESIGN section 5), or not at all."""
+        with unchanged_on_error(self.policy):
+            self._update()
+
+    def _update(self) -> None:
         self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
         batch = self._episode_batch(self.rollout_buffer)
@@ -94,7 +89,7 @@ class PolicyNewtonUpdate(EpisodeCollection):
             self.replay.append(batch)
             if target_kl is not None:
                 self.kl_control.alpha = step.alpha
-        self._share_policy()
+        share_policy(self.policy)
         self._n_updates += 1
         self.last_update = UpdateStats(
             **_step_statistics(estimate, model, step, accepted),
@@ -119,9 +114,10 @@ class PolicyNewtonUpdate(EpisodeCollection):
         env
             Where to simulate; ``None``: the training environment.
         """
-        check_integer("n_episodes", n_episodes, 1)
-        self._share_policy()
-        batch = self._episode_batch(self._collect_fresh(n_episodes, env))
+        n_episodes = COUNT("estimate_curvature: n_episodes", n_episodes)
+        env = (_VEC_ENV | NONE)("estimate_curvature: env", env)
+        share_policy(self.policy)
+        batch = self._episode_batch(self._collect_evaluation_episodes(n_episodes, env))
         return estimate_curvature(
             self.policy,
             self.actor,
@@ -137,14 +133,17 @@ class PolicyNewtonUpdate(EpisodeCollection):
 
     def _scheduled_episodes(self) -> tuple[int | None, int | None]:
         progress = self._current_progress_remaining
-        numbers: list[int | None] = []
-        for name in ("n_episodes", "n_hessian_episodes"):
-            value = getattr(self, name)
-            if callable(value):
-                value = value(progress)
-                check_real(f"{name}({progress:g})", value, 1.0)
-            numbers.append(None if value is None else round(value))
-        return numbers[0], numbers[1]
+
+        def number(name: str, value: int | Schedule | None) -> int | None:
+            if value is None:
+                return None
+            name = f"{type(self).__name__}: {name}"
+            return round(CheckedSchedule(name, value, real(1.0))(progress))
+
+        return (
+            number("n_episodes", self.n_episodes),
+            number("n_hessian_episodes", self.n_hessian_episodes),
+        )
 
     def _episode_batch(self, buffer: RolloutBuffer) -> EpisodeBatch:
         assert isinstance(buffer, EpisodeRolloutBuffer)  # by _setup_model
@@ -185,8 +184,9 @@ class PolicyNewtonUpdate(EpisodeCollection):
 
     def _draw(self, batch: EpisodeBatch, n_episodes: int) -> EpisodeBatch:
         """Draw this rank's share of ``n_episodes`` without replacement."""
-        chosen = self._rng.choice(batch.n_episodes, batch.share(n_episodes), replace=False)
-        return batch.take(chosen)
+        return batch.take(
+            self._rng.choice(batch.n_episodes, batch.share(n_episodes), replace=False)
+        )
 
     def _update_solver(self, batch: EpisodeBatch) -> SubproblemSolver:
         """Return the solver of this update: what CRPN and ACRPN differ in."""
@@ -240,12 +240,11 @@ class PolicyNewtonUpdate(EpisodeCollection):
         )
 
     def _batch_statistics(self, batch: EpisodeBatch) -> dict[str, Any]:
-        assert isinstance(self.rollout_buffer, EpisodeRolloutBuffer)  # by _setup_model
         log_std = getattr(self.policy, "log_std", None)
         return {
             "n_updates": self._n_updates,
             "n_episodes": batch.total_episodes,
-            "used_timesteps_fraction": self.rollout_buffer.used_fraction,
+            "used_timesteps_fraction": self._used_fraction,
             "explained_variance": _explained_variance(batch),
             "std": None if log_std is None else torch.exp(log_std).mean().item(),
         }

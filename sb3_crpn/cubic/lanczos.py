@@ -4,15 +4,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sb3_crpn.cubic.step import (
-    EPS,
-    Array,
-    ArrayLike,
-    CountedOperator,
-    Operator,
-    as_vector,
-    at_least,
-)
+from sb3_crpn.arrays import ArrayLike, FloatArray, Operator, as_vector
+from sb3_crpn.checks import COUNT
+from sb3_crpn.cubic.step import EPS, CountedOperator
 
 # krylov_basis takes a space for invariant where the remainder is below this multiple of EPS·‖A‖:
 # repeated eigenvalues left 5 to 27 for d = 30 to 3000, once 150 for d = 10
@@ -35,7 +29,7 @@ class KrylovSpace:
         self.breakdown = breakdown
         self.dim = like.numel()
         self.size = 0
-        self.projected: Array = np.zeros((0, 0))
+        self.projected: FloatArray = np.zeros((0, 0))
         self.chains: list[list[int]] = []
         self.ends: list[Tensor | None] = []
         self.norm = 0.0  # the largest ‖Aq‖ so far
@@ -99,23 +93,24 @@ def krylov_basis(matvec: Operator, start: ArrayLike, dim: int) -> tuple[Tensor, 
     start
         b, [d]. Zero spans nothing: k = 0.
     dim
-        Columns wanted, ≥ 1.
+        Columns wanted, ≥ 1; more than d are d.
 
     Returns
     -------
     tuple[Tensor, Tensor]
-        Q and AQ, [d, k], float64, k ≤ dim; fewer where the space is invariant before.
+        Q and AQ, [d, k], float64, k ≤ min(d, dim); fewer where the space is invariant before.
 
     Raises
     ------
     ValueError
         For an empty or non-finite ``start``, a non-finite product, dim < 1.
     """
-    vector = as_vector("start", start)
-    space = KrylovSpace(CountedOperator("matvec", matvec), vector, _BREAKDOWN)
+    vector = as_vector("krylov_basis: start", start)
+    size = min(vector.numel(), COUNT("krylov_basis: dim", dim))
+    space = KrylovSpace(CountedOperator("krylov_basis: matvec", matvec), vector, _BREAKDOWN)
     chain = space.open(vector)
     images: list[Tensor] = []
-    for _ in range(at_least("dim", dim, 1)):
+    for _ in range(size):
         image = space.extend(chain)
         if image is None:
             break

@@ -2,38 +2,22 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from functools import cached_property
 
 import torch
-from stable_baselines3.common.distributions import (
-    Distribution,
-    MultiCategoricalDistribution,
-    kl_divergence,
-)
+from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_crpn.curvature.pair_weights import HessianEstimator
 from sb3_crpn.episodes.batch import EpisodeBatch
 from sb3_crpn.parameters import ActorParameters
+from sb3_crpn.policy import action_distribution, mean_divergence
 
 
 def policy_distribution(policy: ActorCriticPolicy, batch: EpisodeBatch) -> Distribution:
-    """Return π(·|s_i;θ) over the batch; a copy, because SB3's policies reuse one object."""
-    return copy.copy(policy.get_distribution(batch.observations))
-
-
-def mean_divergence(old: Distribution, new: Distribution) -> torch.Tensor:
-    """Return the mean of KL(old ‖ new) over the states and the action's k components, a scalar.
-
-    The mean, not the sum, over components is what sb3-contrib's TRPO bounds: a step of one and
-    the same divergence changes each component as much whether there are one or twenty.
-    """
-    divergence = kl_divergence(old, new)  # [T], or [T, k] where SB3 keeps the components apart
-    if isinstance(old, MultiCategoricalDistribution):  # which SB3 sums
-        divergence = divergence / len(old.action_dims)
-    return divergence.mean()
+    """Return π(·|s_i;θ) over the batch."""
+    return action_distribution(policy, batch.observations)
 
 
 class EpisodeDerivatives:

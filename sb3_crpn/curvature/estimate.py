@@ -10,11 +10,12 @@ from typing import Literal
 import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 
+from sb3_crpn.arrays import IntArray
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from sb3_crpn.curvature.operator import GroupedOperator, require_finite
 from sb3_crpn.curvature.pair_weights import HessianEstimator
 from sb3_crpn.curvature.shrinkage import relative_noise
-from sb3_crpn.episodes.batch import EpisodeBatch, IntArray, episode_chunks, round_robin_split
+from sb3_crpn.episodes.batch import EpisodeBatch, episode_chunks
 from sb3_crpn.parameters import ActorParameters
 
 # Groups whose disagreement measures the noise: two give an unbiased estimate of it, and more of
@@ -58,9 +59,7 @@ class EpisodeFolds:
         estimator: HessianEstimator,
         max_steps: int | None,
     ) -> None:
-        folds = round_robin_split(
-            batch.n_episodes, min(N_GROUPS, batch.total_episodes), first=batch.preceding_episodes
-        )
+        folds = batch.folds(N_GROUPS)
         sizes = [[len(episodes), batch.lengths[episodes].sum()] for episodes in folds]
         self.n_episodes, self.n_steps = batch.total(torch.tensor(sizes, dtype=torch.float64)).T
         self._total = batch.total

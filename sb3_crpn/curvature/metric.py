@@ -68,8 +68,9 @@ class Fisher:
     def whitening(self, form: torch.Tensor) -> torch.Tensor:
         """Return (Λ + ε)^(-½)Qᵀ from VᵀFV = QΛQᵀ; a negative eigenvalue is rounding."""
         eigenvalues, vectors = torch.linalg.eigh(form)
-        scale = (eigenvalues.clamp(min=0.0) + self.damping).pow(-0.5)
-        return scale[:, None] * vectors.T
+        scale: torch.Tensor = (eigenvalues.clamp(min=0.0) + self.damping) ** -0.5
+        whiten: torch.Tensor = scale[:, None] * vectors.T
+        return whiten
 
 
 METRICS: Registry[Metric] = Registry(

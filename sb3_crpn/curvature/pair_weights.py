@@ -7,8 +7,9 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from sb3_crpn.arrays import FloatArray, IntArray
 from sb3_crpn.curvature.registry import Registry
-from sb3_crpn.episodes.batch import FloatArray, IntArray, episode_scan, episode_starts
+from sb3_crpn.episodes.batch import episode_scan, episode_starts
 
 
 @runtime_checkable

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, Generic, TypeVar
 
+from sb3_crpn.checks import Check, requires
+
 T = TypeVar("T")
 
 
@@ -33,10 +35,10 @@ class Registry(dict[str, Callable[[Any], T]], Generic[T]):
             return value in self
         return isinstance(value, self._protocol) and not isinstance(value, type)
 
-    def check(self, name: str, value: object) -> None:
-        """Require a registered name or an object of the protocol for the argument ``name``."""
-        if not self.accepts(value):
-            raise ValueError(f"{name}={value!r} is not allowed, must be {self.allowed}")
+    @property
+    def check(self) -> Check:
+        """The check of an argument: a registered name, or an object of the protocol."""
+        return requires(self.allowed, self.accepts)
 
     @property
     def allowed(self) -> str:

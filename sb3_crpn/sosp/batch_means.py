@@ -9,11 +9,12 @@ import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import Tensor
 
+from sb3_crpn.arrays import Operator
 from sb3_crpn.curvature import Causal
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.parameters import ActorParameters
-from sb3_crpn.sosp.model_covariance import Operator, model_covariance
+from sb3_crpn.sosp.model_covariance import model_covariance
 
 # The causal estimator at κ = 1: unbiased (DESIGN section 2)
 UNBIASED = Causal(1.0)

@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from sb3_crpn.arrays import FloatArray, Operator
 from sb3_crpn.cubic import krylov_basis
-from sb3_crpn.sosp.model_covariance import Operator
-
-FloatArray = npt.NDArray[np.float64]
 
 # Products of one Lanczos run. On CartPole-v1, 64×64, the leftmost Ritz pair of an untrained and of
 # two trained policies had a residual below 1e-6 of the spectrum's width after 20

@@ -149,12 +149,12 @@ def test_the_seed_decides_and_the_global_generator_is_untouched():
     ("change", "message"),
     [
         (dict(gradient=np.array([1.0, np.inf])), "gradient has 1 NaN"),
-        (dict(alpha=-1.0), r"alpha is -1.0"),
-        (dict(tol=0.0), "tol is 0.0"),
-        (dict(max_products=1), "max_products is 1; an integer ≥ 2"),
-        (dict(max_products=2.5), "max_products is 2.5"),
+        (dict(alpha=-1.0), "solve_krylov: alpha=-1.0"),
+        (dict(tol=0.0), "tol=0.0"),
+        (dict(max_products=1), "max_products=1 is not allowed, must be an integer >= 2"),
+        (dict(max_products=2.5), "max_products=2.5"),
         (dict(hvp=lambda v: v[:1]), r"hvp returned shape \(1,\)"),
-        (dict(hvp=lambda v: v * np.nan), "the product of hvp has 2 NaN"),
+        (dict(hvp=lambda v: v * np.nan), "the product of solve_krylov: hvp has 2 NaN"),
     ],
 )
 def test_bad_input(change, message):
@@ -199,7 +199,7 @@ def test_basis_stops_at_breakdown():
 
 
 def test_basis_checks_its_input():
-    with pytest.raises(ValueError, match="dim is 0"):
+    with pytest.raises(ValueError, match="krylov_basis: dim=0"):
         krylov_basis(lambda v: v, np.ones(3), 0)
     with pytest.raises(ValueError, match="start has 1 NaN"):
         krylov_basis(lambda v: v, [np.nan, 1.0], 2)

@@ -92,7 +92,7 @@ def test_estimates_of_single_episodes_hold(estimator):
     for scale in (0.3, 3.0):
         theta = scale * random_parameters(mdp)
         model.actor.assign(theta)
-        batch = model._episode_batch(model._collect_fresh(24, None))
+        batch = model._episode_batch(model._collect_evaluation_episodes(24, None))
         gradients, hessians = episode_estimates(model.policy, model.actor, batch, estimator)
         theta = model.actor.vector
         assert float(gradients.norm(dim=1).max()) <= constants.G_g
@@ -119,6 +119,8 @@ def test_estimates_of_single_episodes_are_attained():
         rewards=np.zeros(H),
         log_probs=np.zeros(H),
         terminal_values=np.zeros(1),
+        times=np.zeros(1, dtype=int),
+        trajectories=np.arange(1),
     )
     gradients, hessians = episode_estimates(policy, actor, batch)
     constants = Constants(K, softmax_linear(1.0), H, len(actor), gamma)
