@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,8 @@ class PolicyNewtonUpdate(RolloutAlgorithm):
         self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
         batch = self._episode_batch(self.rollout_buffer)
+        if not self.tracker.whole_episodes:
+            batch = replace(batch, unit="n_steps")
         earlier = self.replay.reweighted(self.policy, **self._weighting)
         joined = concatenate([batch, *earlier])
         estimate = self._estimate(batch, joined, earlier)
