@@ -12,6 +12,7 @@ from typing import Any
 import pandas as pd
 
 from benchmarks.learning.run import Result, Run
+from benchmarks.learning.settings import same_hyperparameters
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -22,6 +23,7 @@ RUN_COLUMNS = (
     "final_return",
     "steps",
     "episodes",
+    "updates",
     "wall_seconds",
     "cpu_seconds",
     "entry",
@@ -49,6 +51,13 @@ def read_runs(folder: Path) -> pd.DataFrame:
 def read_curves(folder: Path) -> pd.DataFrame:
     """Return the points of all curves, of the latest run where one was repeated."""
     return _read(folder / "curves.csv", CURVE_COLUMNS, [*KEYS, "steps"])
+
+
+def is_done(run: Run, done: pd.DataFrame) -> bool:
+    """Return whether ``done``, rows of runs, has this one with the same hyperparameters."""
+    keys = [getattr(run, name) for name in KEYS]
+    rows = done[(done[list(KEYS)] == keys).all(axis=1)]
+    return any(same_hyperparameters(run.hyperparameters, row) for row in rows["hyperparameters"])
 
 
 def _read(path: Path, columns: Sequence[str], keys: list[str]) -> pd.DataFrame:
