@@ -15,11 +15,12 @@ import argparse
 import itertools
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
+from benchmarks.common.pool import run_all
 from benchmarks.learning import store
-from benchmarks.learning.pool import run_all
-from benchmarks.learning.run import Run, make_run
+from benchmarks.learning.run import Run, execute, make_run
 from benchmarks.learning.settings import ALGORITHMS, BUDGETS, RANDOM, TRPO_EQUAL, parse_setting
 
 
@@ -30,7 +31,8 @@ def main() -> None:
     wanted = list(dict.fromkeys(_wanted_runs(args)))
     missing = [run for run in wanted if not store.is_done(run, done)]
     print(f"{len(wanted) - len(missing)} of {len(wanted)} runs are done: {args.results}")
-    if missing and run_all(missing, args.jobs, args.results):
+    keep = partial(store.append, args.results)
+    if missing and run_all(execute, missing, keep, n_processes=args.jobs):
         sys.exit(1)
 
 

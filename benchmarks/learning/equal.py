@@ -15,12 +15,13 @@ import argparse
 import itertools
 import sys
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from benchmarks.common.pool import run_all
 from benchmarks.learning import store
-from benchmarks.learning.pool import run_all
-from benchmarks.learning.run import Run, make_run
+from benchmarks.learning.run import Run, execute, make_run
 from benchmarks.learning.settings import BUDGETS, TRPO_EQUAL
 
 RESULTS = Path(__file__).parent / "equal"
@@ -77,7 +78,8 @@ def main() -> None:
     wanted = list(wanted_runs(args.envs, args.timesteps))
     missing = [run for run in wanted if not any(store.is_done(run, rows) for rows in done)]
     print(f"{len(wanted) - len(missing)} of {len(wanted)} runs are done: {args.results}")
-    if missing and run_all(missing, args.jobs, args.results):
+    keep = partial(store.append, args.results)
+    if missing and run_all(execute, missing, keep, n_processes=args.jobs):
         sys.exit(1)
 
 

@@ -115,7 +115,7 @@ def _train(run: Run) -> Result:
     from stable_baselines3.common.vec_env import sync_envs_normalization
 
     with tempfile.TemporaryDirectory() as folder:
-        manager, model = _set_up(run, Path(folder))
+        manager, model = set_up(run, Path(folder))
         recorder = _episode_recorder(run.timesteps)
         wall, cpu = time.perf_counter(), time.process_time()
         model.learn(run.timesteps, callback=recorder)
@@ -141,7 +141,7 @@ def _train(run: Run) -> Result:
     return Result(row, curve)
 
 
-def _set_up(run: Run, folder: Path) -> tuple[Any, Any]:
+def set_up(run: Run, folder: Path) -> tuple[Any, Any]:
     """Return rl-zoo's manager and the model, made from the run's hyperparameters as rl-zoo does."""
     import yaml
     from rl_zoo3.exp_manager import ExperimentManager
