@@ -37,7 +37,7 @@ from benchmarks.common.figures import PALETTE
 from benchmarks.common.table import Row
 from benchmarks.experiments.study import Study
 from sb3_crpn import CRPN
-from sb3_crpn.curvature import PairWeights
+from sb3_crpn.curvature import Causal
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.episodes.batch import episode_starts
@@ -124,7 +124,7 @@ class _Checkpoints(BaseCallback):
 
 def _halves(model: CRPN, batch: EpisodeBatch, kappa: float) -> list[Operator]:
     """Return the products with the Hessians of either half of the episodes."""
-    weights = PairWeights("causal", kappa)
+    weights = Causal(kappa)
     return [
         EpisodeDerivatives(model.policy, model.actor, part, weights).hessian_product
         for part in batch.split(2)
