@@ -7,8 +7,9 @@ from functools import cache
 
 import torch
 
+from benchmarks.common.table import Row
 from benchmarks.speed.problems import SHAPES, collect, noise_model
-from benchmarks.speed.timing import Row, Task, compare
+from benchmarks.speed.timing import Task, compare
 from sb3_crpn import CRPN
 from sb3_crpn.algorithm import PolicyNewtonAlgorithm
 from sb3_crpn.episodes import EpisodeBatch
