@@ -79,7 +79,7 @@ def published() -> str:
 
 
 def headline() -> str:
-    """The same in short, for the README."""
+    """Mean returns over training alone, for the README."""
     found = _results(store.RESULTS.name, "TRPO")
     learners = ("CRPN", "ACRPN", "TRPO")
     rows = [["mean return over training", "seeds", *learners]]

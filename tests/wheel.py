@@ -1,6 +1,7 @@
-"""Train, save, load and ask for help with an installed package; run with the interpreter that has it.
+"""Train, save, load and ask for help with an installed package.
 
-A script, not a test module: `python tests/wheel.py` outside the source tree.
+A script, not a test module: `PYTHON tests/wheel.py`, outside the source tree, with the interpreter
+that the package is installed for.
 """
 
 import subprocess
