@@ -15,12 +15,23 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 
+import pandas as pd
+
 from benchmarks.learning import comparison, store, tables
 from benchmarks.learning.comparison import Comparison
+from benchmarks.learning.settings import BUDGETS
 from benchmarks.learning.statistics import interquartile_mean, stratified_bootstrap
 
 ROOT = Path(__file__).parents[1]
 LEARNING = Path(__file__).parent / "learning"
+# Columns of the table at equal settings: algorithm and setting of their rows
+EQUAL_ARMS = {
+    "CRPN": ("CRPN", ""),
+    "ACRPN": ("ACRPN", ""),
+    "CRPN, H = 0": ("CRPN", "hessian_shrinkage=0.0"),
+    "TRPO": ("TRPO-equal", ""),
+}
+MIN_SEEDS = 3
 BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -79,10 +90,50 @@ def published() -> str:
 
 
 def headline() -> str:
-    """Mean returns over training alone, for the README."""
+    """Mean returns over training at equal settings; while none are measured, of the entries."""
+    found = equal_runs()
+    if found.empty:
+        note = "Mean return over training, each algorithm with its published hyperparameters."
+        return f"{note}\n\n{_entries()}"
+    note = (
+        "Mean return over training. All arms have CRPN's hyperparameters: environments, timesteps "
+        "of an update, γ, λ, network, first noise, KL target and critic work."
+    )
+    rows = [["environment", "seeds", *EQUAL_ARMS]]
+    for env, runs in found.groupby("env", sort=False):
+        returns = [runs[runs.arm == arm].mean_return.to_numpy(float) for arm in EQUAL_ARMS]
+        rows.append([str(env), str(len(returns[0])), *map(tables.mean_cell, returns)])
+    return f"{note}\n\n{_markdown(rows)}"
+
+
+def equal_runs() -> pd.DataFrame:
+    """Return the runs of the equal-settings arms, of the seeds that all arms of a task have."""
+    columns = [*store.KEYS, "hyperparameters", "mean_return"]
+    published = _results(store.RESULTS.name, "TRPO").runs[columns]
+    own = store.read_runs(LEARNING / "equal")[columns]
+    found = []
+    for env, budget in BUDGETS.items():
+        runs = pd.concat([published, own], ignore_index=True) if len(own) else published
+        runs = runs[(runs.env == env) & (runs.timesteps == budget)]
+        arms = {arm: _arm(runs, *choice) for arm, choice in EQUAL_ARMS.items()}
+        seeds = set.intersection(*(set(rows.seed) for rows in arms.values()))
+        if len(seeds) >= MIN_SEEDS:
+            found += [r[r.seed.isin(seeds)].assign(arm=arm) for arm, r in arms.items()]
+    return pd.concat(found) if found else pd.DataFrame(columns=[*columns, "arm"])
+
+
+def _arm(runs: pd.DataFrame, algo: str, setting: str) -> pd.DataFrame:
+    rows = runs[runs.algo == algo]
+    own = rows[rows.setting == setting]
+    if own.empty:  # the entry has the setting already: the same run
+        own = rows[(rows.setting == "") & rows.hyperparameters.str.contains(setting, regex=False)]
+    return own.drop_duplicates("seed", keep="last").sort_values("seed")
+
+
+def _entries() -> str:
     found = _results(store.RESULTS.name, "TRPO")
     learners = ("CRPN", "ACRPN", "TRPO")
-    rows = [["mean return over training", "seeds", *learners]]
+    rows = [["environment", "seeds", *learners]]
     for task in found.tasks:
         seeds = str(len(found.values("CRPN", task, "mean_return")))
         rows.append([task, seeds, *_cells(found, learners, task, "mean_return")])
