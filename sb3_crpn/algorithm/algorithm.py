@@ -37,9 +37,9 @@ from sb3_crpn.algorithm.update import PolicyNewtonUpdate
 from sb3_crpn.checks import POSITIVE, not_allowed
 from sb3_crpn.distributed import rank, rank_seed
 from sb3_crpn.episodes import (
+    TRACKERS,
     DictEpisodeRolloutBuffer,
     EpisodeRolloutBuffer,
-    EpisodeTracker,
     Replay,
     Tracker,
 )
@@ -147,7 +147,14 @@ class PolicyNewtonAlgorithm(PolicyNewtonUpdate):
         fuse(self.policy.optimizer)
         self.alpha_schedule = CheckedSchedule(f"{type(self).__name__}: alpha", self.alpha, POSITIVE)
         self.replay = Replay(self.n_reused_rollouts, self.gamma, self.gae_lambda)
-        self.tracker: Tracker = EpisodeTracker()
+        self.tracker: Tracker = (
+            TRACKERS[self.rollout]() if isinstance(self.rollout, str) else self.rollout()
+        )
+        if not self.tracker.whole_episodes:
+            for name in ("n_episodes", "n_hessian_episodes"):
+                if (value := getattr(self, name)) is not None:
+                    argument = f"{type(self).__name__}: {name}"
+                    raise not_allowed(argument, value, "None where rollouts are of timesteps")
         if self.env is not None and self.tracker.whole_episodes and self.horizon is None:
             warn_of_endless_episodes(self.env)
 

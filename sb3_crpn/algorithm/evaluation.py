@@ -63,7 +63,7 @@ class CandidateEvaluator:
     ) -> None:
         self.batch, self.n_trials = batch, 0
         self._policy, self._actor = policy, actor
-        self._sizes = torch.tensor([batch.n_steps, batch.n_episodes], dtype=torch.float64)
+        self._sizes = torch.tensor([batch.n_steps, batch.size], dtype=torch.float64)
         self._origin = actor.snapshot()
         self._vector = actor.vector
         self._pieces: list[tuple[EpisodeBatch, Distribution, torch.Tensor, torch.Tensor]] = []
@@ -82,8 +82,8 @@ class CandidateEvaluator:
         self.move(step)
         sums = torch.tensor(self._sums(), dtype=torch.float64)
         total = self.batch.total(torch.cat([sums, self._sizes]))
-        divergence, change, n_steps, n_episodes = total.tolist()
-        return StepEvaluation(divergence / n_steps, change / n_episodes)
+        divergence, change, n_steps, size = total.tolist()
+        return StepEvaluation(divergence / n_steps, change / size)
 
     def move(self, step: torch.Tensor) -> None:
         """Move the actor to θ + ``step``, [d]."""

@@ -38,7 +38,7 @@ from sb3_crpn.curvature import (
     Metric,
     Shrinkage,
 )
-from sb3_crpn.episodes import EpisodeRolloutBuffer
+from sb3_crpn.episodes import TRACKERS, EpisodeRolloutBuffer, Tracker
 
 
 def _is_policy(value: object) -> bool:
@@ -70,6 +70,10 @@ _POLICY = requires(
     _is_policy,
 )
 _ENV = requires("an environment or a registered id", lambda value: True)
+_TRACKER = requires(
+    '"episodes", "timesteps" or a class of Tracker',
+    lambda value: value in TRACKERS if isinstance(value, str) else callable(value),
+)
 _DEVICE = requires('"auto" or a device of PyTorch', _is_device)
 _BUFFER = requires("a subclass of EpisodeRolloutBuffer", _is_buffer_class)
 LEARNING_RATE = real(0.0)
@@ -123,12 +127,20 @@ class PolicyNewtonSettings:
     )
     n_steps: int = setting(
         COUNT,
-        "Target timesteps per environment and update, met in whole episodes of the last update's "
-        "mean length (at least one per environment). Before the first update one episode of each "
-        "environment tells the length, and is not learnt from if more are to be run.",
+        "Timesteps per environment and update. Whole episodes meet it as a target, at the mean "
+        "length of the last update's (at least one per environment). Before the first update one "
+        "episode of each environment tells the length, and is not learnt from if more are to be "
+        "run.",
         1024,
     )
     _: KW_ONLY
+    rollout: str | Callable[[], Tracker] = setting(
+        _TRACKER,
+        '"episodes": whole episodes, without length bias, and the paper\'s; "timesteps": SB3\'s '
+        "``n_steps`` of each environment, which goes on from where it stood, segments bootstrapped "
+        "with V; or a class of :class:`~sb3_crpn.episodes.Tracker`.",
+        "episodes",
+    )
     n_episodes: int | Schedule | None = setting(
         COUNT | SCHEDULE | NONE,
         "m_k, the episodes of the gradient: an int or a schedule; ``None``: from ``n_steps``.",
@@ -217,7 +229,8 @@ class PolicyNewtonSettings:
     )
     horizon: int | None = setting(
         COUNT | NONE,
-        "H, the step after which episodes are cut; ``None``: episodes end by themselves.",
+        "H, the step after which whole episodes are cut, in training, estimates and certificates; "
+        "``None``: episodes end by themselves. Timesteps are not cut.",
         None,
     )
     batch_size: int = setting(COUNT, "Minibatch size of the critic.", 128)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from stable_baselines3.common.logger import Logger
 
 
 @dataclass(frozen=True)
 class UpdateStats:
-    """The statistics of one update, ``model.last_update``.
+    """The statistics of one update, ``model.last_update``; each is logged under its name.
 
     J, advantages and returns are in the units of the rewards that the algorithm sees; advantages
     may be normalised. A rejected step has moved nothing: its length and its effects are 0.
@@ -30,7 +30,7 @@ class UpdateStats:
         m(0) - m(s) of the cubic model, in the units of J.
     step_norm
         ‖s‖, Euclidean.
-    kl
+    kl_divergence
         Mean KL(old ‖ new) over states and action components, in nats.
     surrogate_change
         (1/m) Σ_i A_i (π_new/π_old - 1), a cost: negative is an improvement.
@@ -75,7 +75,7 @@ class UpdateStats:
     multiplier: float
     predicted_decrease: float
     step_norm: float
-    kl: float
+    kl_divergence: float
     surrogate_change: float
     policy_objective: float
     accepted: bool
@@ -95,47 +95,26 @@ class UpdateStats:
     std: float | None
 
     @property
-    def rejected(self) -> bool:
+    def step_rejected(self) -> bool:
         """Whether the actor was put back."""
         return not self.accepted
 
     def write(self, logger: Logger) -> None:
-        """Record every entry of ``LOG_KEYS`` that the update has."""
-        for key, field in LOG_KEYS.items():
-            value = getattr(self, field)
+        """Record the fields that the update has, and the entries of ``LOG_KEYS``, below train/."""
+        names = {field.name: field.name for field in fields(self) if field.name not in NOT_LOGGED}
+        for key, name in (names | LOG_KEYS).items():
+            value = getattr(self, name)
             if value is not None:
                 value = int(value) if isinstance(value, bool) else value
                 exclude = "tensorboard" if key in NOT_IN_TENSORBOARD else None
                 logger.record(f"train/{key}", value, exclude=exclude)
 
 
-# Log key below train/ → field. Keys in the last block are those of sb3-contrib's TRPO.
+# Log keys that are no fields; the last two are those of sb3-contrib's TRPO
 LOG_KEYS = {
-    "gradient_norm": "gradient_norm",
-    "gradient_noise": "gradient_noise",
-    "alpha": "alpha",
-    "multiplier": "multiplier",
-    "predicted_decrease": "predicted_decrease",
-    "step_norm": "step_norm",
-    "kl_divergence": "kl",
-    "surrogate_change": "surrogate_change",
-    "step_rejected": "rejected",
-    "n_trials": "n_trials",
-    "certified": "certified",
-    "solver_status": "solver_status",
-    "lambda_min": "lambda_min",
-    "hessian_vector_products": "hessian_vector_products",
-    "hessian_shrinkage": "hessian_shrinkage",
-    "n_episodes": "n_episodes",
-    "n_reused_rollouts": "n_reused_rollouts",
-    "used_timesteps_fraction": "used_timesteps_fraction",
-    "target_kl": "target_kl",
-    "explained_variance": "explained_variance",
-    "value_loss": "value_loss",
-    "std": "std",
-    "n_updates": "n_updates",
-    "kl_divergence_loss": "kl",
-    "policy_objective": "policy_objective",
+    "step_rejected": "step_rejected",
+    "kl_divergence_loss": "kl_divergence",
     "is_line_search_success": "accepted",
 }
+NOT_LOGGED = {"accepted", "at_sosp"}
 NOT_IN_TENSORBOARD = {"solver_status", "n_updates"}

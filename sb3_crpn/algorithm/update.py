@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,8 @@ class PolicyNewtonUpdate(RolloutAlgorithm):
         self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
         batch = self._episode_batch(self.rollout_buffer)
+        if not self.tracker.whole_episodes:
+            batch = replace(batch, unit="n_steps")
         earlier = self.replay.reweighted(self.policy, **self._weighting)
         joined = concatenate([batch, *earlier])
         estimate = self._estimate(batch, joined, earlier)
@@ -264,7 +267,7 @@ def _step_statistics(
         "multiplier": cubic.multiplier,
         "predicted_decrease": cubic.predicted_decrease,
         "step_norm": float(step.step.norm()) if accepted else 0.0,
-        "kl": step.kl if accepted else 0.0,
+        "kl_divergence": step.kl if accepted else 0.0,
         "surrogate_change": change,
         "policy_objective": -mean_cost - change * batch.total_episodes / batch.total_steps,
         "accepted": accepted,

@@ -84,7 +84,7 @@ class EpisodeDerivatives:
     def gradient(self) -> torch.Tensor:
         """Return (1/n) Σ_episodes Σ_i A_i σ_i, [d] (Theorem 1)."""
         _, score = self._weighted_score
-        return self._actor.flatten(s.detach() for s in score) / self.batch.n_episodes
+        return self._actor.flatten(s.detach() for s in score) / self.batch.size
 
     def hessian_product(self, vector: torch.Tensor) -> torch.Tensor:
         """Return (1/n) Σ_episodes [Σ_ij W_ij σ_i σ_jᵀ + Σ_i A_i ∇²log π_i] v, [d].
@@ -103,7 +103,7 @@ class EpisodeDerivatives:
             retain_graph=True,
             materialize_grads=True,
         )
-        return (self._actor.flatten(outer) + curvature) / self.batch.n_episodes
+        return (self._actor.flatten(outer) + curvature) / self.batch.size
 
     def quadratic_form(self, basis: torch.Tensor) -> torch.Tensor:
         """Return VᵀHV for V = ``basis`` [d, k], H as in :meth:`hessian_product`, [k, k].
@@ -117,7 +117,7 @@ class EpisodeDerivatives:
         )
         U = u.to("cpu", torch.float64).numpy()
         outer = U.T @ self._estimator.apply(self.batch.cost_advantages, self.batch.lengths, U)
-        return (torch.from_numpy(outer).to(basis) + basis.T @ curvature) / self.batch.n_episodes
+        return (torch.from_numpy(outer).to(basis) + basis.T @ curvature) / self.batch.size
 
     def _along(self, vector: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return u = Jv, [T], and ∇(Σ_i A_i σ_i·v), [d], by one backward pass."""

@@ -47,8 +47,8 @@ class EpisodeFolds:
 
     Attributes
     ----------
-    n_episodes, n_steps
-        Sizes of the folds over all ranks, float64 [K].
+    size, n_steps
+        The folds' ``unit``s and steps over all ranks, float64 [K].
     """
 
     def __init__(
@@ -61,7 +61,8 @@ class EpisodeFolds:
     ) -> None:
         folds = batch.folds(N_GROUPS)
         sizes = [[len(episodes), batch.lengths[episodes].sum()] for episodes in folds]
-        self.n_episodes, self.n_steps = batch.total(torch.tensor(sizes, dtype=torch.float64)).T
+        n_episodes, self.n_steps = batch.total(torch.tensor(sizes, dtype=torch.float64)).T
+        self.size = self.n_steps if batch.unit == "n_steps" else n_episodes
         self._total = batch.total
         self._zero = torch.zeros(len(actor), dtype=torch.float64, device=actor.device)
 
@@ -81,12 +82,12 @@ class EpisodeFolds:
 
     def gradients(self) -> torch.Tensor:
         """Return the gradient of each fold, [K, d]."""
-        return self._total(self._terms(EpisodeDerivatives.gradient, "n_episodes", self._zero))
+        return self._total(self._terms(EpisodeDerivatives.gradient, "size", self._zero))
 
     def operator(
         self,
         product: Callable[[EpisodeDerivatives, torch.Tensor], torch.Tensor],
-        unit: Literal["n_episodes", "n_steps"],
+        unit: Literal["size", "n_steps"],
         form: Callable[[EpisodeDerivatives, torch.Tensor], torch.Tensor] | None = None,
     ) -> GroupedOperator:
         """Return the matrix B whose products, and forms VᵀBV, are means over ``unit``."""
@@ -109,7 +110,7 @@ class EpisodeFolds:
     def _terms(
         self,
         quantity: Callable[[EpisodeDerivatives], torch.Tensor],
-        unit: Literal["n_episodes", "n_steps"],
+        unit: Literal["size", "n_steps"],
         zero: torch.Tensor,
     ) -> torch.Tensor:
         """Return the terms that this rank adds to the folds' means of ``quantity``, [K, …].
@@ -191,9 +192,9 @@ def estimate_curvature(
 
     folds = EpisodeFolds(policy, actor, batch, estimator, max_steps)
     gradients = folds.gradients()
-    shares = (folds.n_episodes / folds.n_episodes.sum()).to(gradients.device)
+    shares = (folds.size / folds.size.sum()).to(gradients.device)
     hessian = folds_of(hessian_batch).operator(
-        EpisodeDerivatives.hessian_product, "n_episodes", EpisodeDerivatives.quadratic_form
+        EpisodeDerivatives.hessian_product, "size", EpisodeDerivatives.quadratic_form
     )
     return CurvatureEstimate(
         gradient=require_finite("the gradient", shares @ gradients),
