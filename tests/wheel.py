@@ -26,5 +26,5 @@ with tempfile.TemporaryDirectory() as folder:
         assert loaded.predict(observation, deterministic=True)[0] == action
         assert (loaded.actor.vector == model.actor.vector).all()
 assert config_file("crpn").is_file()
-subprocess.run([sys.executable, "-m", "sb3_crpn.cli", "--help"], check=True, capture_output=True)
+subprocess.run([sys.executable, "-m", "sb3_crpn", "--help"], check=True, capture_output=True)
 print(f"{sb3_crpn.__file__}: trained, saved and loaded")
