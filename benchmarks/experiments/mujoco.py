@@ -26,8 +26,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from torch import nn
 
+from benchmarks.common.figures import PALETTE
+from benchmarks.common.table import Row
 from benchmarks.experiments.learners import PAPER_GRADIENT
-from benchmarks.experiments.study import PALETTE, Row, Study
+from benchmarks.experiments.study import Study
 from benchmarks.reinforce import REINFORCE
 from sb3_crpn import CRPN, PAPER
 from sb3_crpn.algorithm import PolicyNewtonAlgorithm

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 from sb3_crpn.checks import COUNT, POSITIVE, integer
 from sb3_crpn.theory.constants import Constants
-from sb3_crpn.theory.recipes import PROBABILITY, Recipe, batches
+from sb3_crpn.theory.recipes import CONSTANTS, PROBABILITY, Recipe, batches
 
 # Theorem on the approximate solution: "c_1, c_2 = 1/300 and c_3, c_4 = 1/200"; c_2 is not used
 C_1 = 1 / 300
@@ -39,6 +39,9 @@ class PrintedConstants:
     """
 
     problem: Constants
+
+    def __post_init__(self) -> None:
+        CONSTANTS("PrintedConstants: problem", self.problem)
 
     @property
     def initial_gap(self) -> float:
@@ -84,7 +87,7 @@ class PrintedConstants:
 
     def gradient_error(self, n_episodes: int) -> float:
         """Bound (E‖g - ∇J‖²)^½ of the mean of m episodes: G_g/√m (Lemma 5)."""
-        n_episodes = COUNT("PrintedConstants.gradient_error: n_episodes", n_episodes)
+        n_episodes = COUNT("gradient_error: n_episodes", n_episodes)
         return self.G_g / math.sqrt(n_episodes)
 
     def hessian_error(self, n_episodes: int) -> float:
@@ -97,8 +100,8 @@ class PrintedConstants:
         ValueError
             For fewer episodes than the lemma supposes.
         """
-        check = integer(self.least_hessian_episodes)
-        n_episodes = check("PrintedConstants.hessian_error: n_episodes", n_episodes)
+        allowed = integer(self.least_hessian_episodes)
+        n_episodes = allowed("hessian_error: n_episodes", n_episodes)
         cube = 4.0 * math.sqrt(15.0 * self._logarithm) * self.problem.d * self.G_H**3
         return float(cube ** (1 / 3)) / math.sqrt(n_episodes)
 
@@ -135,8 +138,8 @@ def printed_expectation_recipe(
     ValueError
         ``epsilon`` or ``initial_gap`` is out of range.
     """
-    printed = PrintedConstants(constants)
-    n_updates = _n_updates(printed, epsilon, initial_gap, 12.0)
+    printed, epsilon, gap = _checked("printed_expectation_recipe", constants, epsilon, initial_gap)
+    n_updates = _n_updates(printed, epsilon, gap, 12.0)
     m = math.ceil(25.0 * printed.G_g**2 / (4.0 * epsilon**2))
     root = (30.0 * (1.0 + 2.0 * math.log(2.0 * constants.d))) ** (1 / 3)
     b = math.ceil(36.0 * root * constants.d ** (2 / 3) * printed.G_H**2 / epsilon)
@@ -171,10 +174,10 @@ def printed_high_probability_recipe(
     ValueError
         An argument is out of range.
     """
-    printed = PrintedConstants(constants)
-    n_updates = _n_updates(printed, epsilon, initial_gap, 12.0)
-    name = "printed_high_probability_recipe: failure_probability"
-    failure_probability = PROBABILITY(name, failure_probability)
+    name = "printed_high_probability_recipe"
+    printed, epsilon, gap = _checked(name, constants, epsilon, initial_gap)
+    failure_probability = PROBABILITY(f"{name}: failure_probability", failure_probability)
+    n_updates = _n_updates(printed, epsilon, gap, 12.0)
     logarithm = math.log(4.0 * constants.d * n_updates / failure_probability)
     gradient, hessian = printed.M_1 / (2.0 * epsilon / 5.0), printed.M_2 / math.sqrt(epsilon / 144)
     m = math.ceil(max(gradient, gradient**2) * 8 / 3 * logarithm)
@@ -213,10 +216,10 @@ def printed_approximate_recipe(
     ValueError
         An argument is out of range.
     """
-    printed = PrintedConstants(constants)
-    n_updates = _n_updates(printed, epsilon, initial_gap, 100.0)
-    name = "printed_approximate_recipe: failure_probability"
-    failure_probability = PROBABILITY(name, failure_probability)
+    name = "printed_approximate_recipe"
+    printed, epsilon, gap = _checked(name, constants, epsilon, initial_gap)
+    failure_probability = PROBABILITY(f"{name}: failure_probability", failure_probability)
+    n_updates = _n_updates(printed, epsilon, gap, 100.0)
     gradient, hessian = printed.M_1 / epsilon, printed.M_2 / math.sqrt(printed.L_H * epsilon)
     argument = constants.d * math.sqrt(printed.L_H) / (epsilon**1.5 * failure_probability)
     m = math.ceil(max(gradient / C_1, (gradient / C_3) ** 2) * math.log(argument / C_3))
@@ -243,10 +246,8 @@ def printed_approximate_complexity(
     Those of Theorems 2 and 3 are :attr:`Recipe.gradient_episodes` and
     :attr:`Recipe.hessian_episodes` (Remark 2).
     """
-    printed = PrintedConstants(constants)
-    epsilon = POSITIVE("epsilon", epsilon)
-    gap = printed.initial_gap if initial_gap is None else initial_gap
-    gap = POSITIVE("initial_gap", gap)
+    name = "printed_approximate_complexity"
+    printed, epsilon, gap = _checked(name, constants, epsilon, initial_gap)
     gradient, hessian = printed.M_1 / epsilon, printed.M_2 / math.sqrt(printed.L_H * epsilon)
     updates = gap * math.sqrt(printed.L_H) / epsilon**1.5
     return (
@@ -255,12 +256,16 @@ def printed_approximate_complexity(
     )
 
 
-def _n_updates(
-    printed: PrintedConstants, epsilon: float, initial_gap: float | None, factor: float
-) -> int:
-    """Return ⌈factor (J(θ_0) - J*) √L_H / ε^{3/2}⌉."""
-    epsilon = POSITIVE("epsilon", epsilon)
+def _checked(
+    function: str, constants: Constants, epsilon: float, initial_gap: float | None
+) -> tuple[PrintedConstants, float, float]:
+    """Return the printed constants, ε and J(θ_0) - J* or its bound, for good arguments."""
+    printed = PrintedConstants(CONSTANTS(f"{function}: constants", constants))
     gap = printed.initial_gap if initial_gap is None else initial_gap
-    gap = POSITIVE("initial_gap", gap)
-    n_updates: int = math.ceil(factor * gap * math.sqrt(printed.L_H / epsilon) / epsilon)
-    return n_updates
+    epsilon = POSITIVE(f"{function}: epsilon", epsilon)
+    return printed, epsilon, POSITIVE(f"{function}: initial_gap", gap)
+
+
+def _n_updates(printed: PrintedConstants, epsilon: float, gap: float, factor: float) -> int:
+    """Return ⌈factor (J(θ_0) - J*) √L_H / ε^{3/2}⌉."""
+    return math.ceil(factor * gap * math.sqrt(printed.L_H / epsilon) / epsilon)

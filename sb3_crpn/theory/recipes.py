@@ -53,7 +53,7 @@ _STEP_DIVISOR = 20.0
 # κ, the negative curvature, as a part of √(ρε), that the descent must make out
 _VISIBLE_CURVATURE = 0.25
 
-_CONSTANTS = requires("a Constants", lambda value: isinstance(value, Constants))
+CONSTANTS = requires("a Constants", lambda value: isinstance(value, Constants))
 PROBABILITY = real(0.0, 1.0, open_low=True, open_high=True)
 
 
@@ -270,7 +270,7 @@ def _checked(
     function: str, constants: Constants, epsilon: float, initial_gap: float | None, plan: _Plan
 ) -> tuple[float, int]:
     """Return ε and the least N whose gains exceed J(θ_0) - J*, for good arguments."""
-    constants = _CONSTANTS(f"{function}: constants", constants)
+    constants = CONSTANTS(f"{function}: constants", constants)
     largest = constants.M_H**2 / constants.L_H
     epsilon = real(0.0, largest, open_low=True)(f"{function}: epsilon", epsilon)
     if initial_gap is None:
