@@ -31,7 +31,7 @@ def product_tasks(model: PolicyNewtonAlgorithm, batch: EpisodeBatch) -> dict[str
     Their graphs are kept from one product to the next, so what is timed is each further product;
     where ``max_batch_timesteps`` splits the batch, none are kept.
     """
-    estimate = cache(lambda: model._estimate_from(batch, batch))
+    estimate = cache(lambda: model._estimate_from(batch))
     vector = torch.linspace(-1.0, 1.0, len(model.actor), dtype=torch.float64)
     return {
         "gradient": Task(gradient_of(model, batch)),

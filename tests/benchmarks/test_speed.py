@@ -99,7 +99,7 @@ def test_the_timed_gradient_is_that_of_the_update():
     model.actor.flatten = lambda tensors: flattened.append(flatten(tensors)) or flattened[-1]
     products.gradient_of(model, batch)()
     del model.actor.flatten
-    expected = model._estimate_from(batch, batch).gradient
+    expected = model._estimate_from(batch).gradient
     torch.testing.assert_close(flattened[-1] / 2, expected, rtol=1e-5, atol=1e-6)
     assert list(product_tasks(model, batch)) == list(memory.PRODUCTS)
 
@@ -119,7 +119,7 @@ def test_updates_are_compared_on_the_same_rollout_and_repeat_it():
         task.prepare()
         assert ours.n_critic_updates == 0
         task.run()
-        results.append((ours.actor.vector, ours._fitted_alpha, ours._n_updates))
+        results.append((ours.actor.vector, ours.kl_control.alpha, ours._n_updates))
     assert torch.equal(results[0][0], results[1][0])
     assert results[0][1:] == results[1][1:]
     assert ours._n_updates == updates.WARM_UP_ROLLOUTS + 1
