@@ -2,12 +2,11 @@
 
     python -m benchmarks.learning.equal       # run what is missing, short tasks first
     python -m benchmarks.learning.equal --envs CartPole-v1 --jobs 1
-    python -m benchmarks.learning.equal --write docs/benchmarks/EQUAL_SETTINGS.md
+    python -m benchmarks.learning.equal --write docs/EQUAL_SETTINGS.md
 
 Everything that the algorithms have in common is one and the same for an environment: environments,
-steps of an update, γ, λ, network, first action noise, normalisation, KL target and critic work.
-Seeds chose nothing: entries were tuned on others. A run that the benchmark's results or the results
-of this command hold already is not repeated.
+steps of an update, γ, λ, network, first action noise, normalisation, KL target and critic work. A
+run that the benchmark's results or this command's hold already is not repeated.
 """
 
 from __future__ import annotations
@@ -117,8 +116,8 @@ def _arms(env: str, seed: int, timesteps: int | None) -> list[Run]:
 
 def load(folders: Sequence[Path], timesteps: int | None = None) -> Comparison:
     """Return the runs of these arms, for the seeds that all arms have, and the random policy's."""
-    runs = pd.concat([store.read_runs(folder) for folder in folders], ignore_index=True)
-    curves = pd.concat([store.read_curves(folder) for folder in folders], ignore_index=True)
+    runs = _joined([store.read_runs(folder) for folder in folders])
+    curves = _joined([store.read_curves(folder) for folder in folders])
     found = []
     for env, seed in _cases():
         arms = [(run, store.matches(run, runs)) for run in _arms(env, seed, timesteps)]
@@ -127,6 +126,12 @@ def load(folders: Sequence[Path], timesteps: int | None = None) -> Comparison:
     envs = {rows.env.iloc[0] for rows in found}
     random = runs[(runs.algo == RANDOM) & runs.env.isin(envs)]
     return compare(pd.concat([*found, random], ignore_index=True), curves, TRPO_EQUAL)
+
+
+def _joined(frames: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Return the rows of all; columns of frames without rows have no type."""
+    found = [frame for frame in frames if not frame.empty]
+    return pd.concat(found or frames[:1], ignore_index=True)
 
 
 REPORT = """# Equal settings
@@ -139,7 +144,9 @@ line search are sb3-contrib's. An update of CRPN has whole episodes, and so may 
 `n_steps`; where all episodes last 1,000 steps, TRPO's updates have as many. Where the entry has no
 Hessian (Walker2d-v5), CRPN is the arm without it.
 
-Entries were tuned on seeds from 10 on; these are from 0 on, and only those that all arms have.
+Seeds are those that all arms have. Some settings of the entries were tried on seeds 0 to 3 over a
+part of the budget ([which](benchmarks.md)), the others on seeds from 10 on; all were chosen for
+CRPN as it is.
 
 ## Aggregate
 
