@@ -27,6 +27,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from torch import nn
 
 from benchmarks.common.figures import PALETTE
+from benchmarks.common.markdown import markdown
 from benchmarks.common.table import Row
 from benchmarks.experiments.learners import PAPER_GRADIENT
 from benchmarks.experiments.study import Study
@@ -157,35 +158,35 @@ def draw(rows: pd.DataFrame) -> Figure:
 
 def table(rows: pd.DataFrame) -> str:
     """Return a Markdown table: medians over all updates of all seeds, and the ends of training."""
-    lines = [
-        "| | learner | updates | first return | last return | ‖g‖ | noise of g "
-        "| -λ_min(H)/multiplier | step | median KL | largest KL | confirmed, before | after |",
-        "|---" * 13 + "|",
-    ]
+    head = ["", "learner", "seeds", "updates", "first return", "last return", "‖g‖", "noise of g",
+            "-λ_min(H)/multiplier", "step", "KL", "largest KL", "confirmed, before",
+            "after"]  # fmt: skip
+    body = []
     for (env, learner), group in rows.groupby(["env", "learner"], sort=False):
-        ends = group.groupby("seed")
-        share = -group.lambda_min / group.multiplier
+        runs = group.groupby("seed")
         cells = [
-            f"{ends.size().median():.0f}",
-            *(f"{_mean_of(ends, part):.4g}" for part in ("head", "tail")),
-            *(f"{group[name].median():.3g}" for name in ("gradient_norm", "gradient_noise")),
-            f"{share.median():.3f}",
-            f"{group.step_norm.median():.2g}",
-            f"{group.kl_divergence.median():.2g}",
+            f"{runs.ngroups}",
+            f"{runs.size().median():.0f}",
+            f"{runs.head(1).mean_return.mean():.4g}",
+            f"{runs.tail(1).mean_return.mean():.4g}",
+            _median(group.gradient_norm),
+            _median(group.gradient_noise),
+            _median(-group.lambda_min / group.multiplier),
+            _median(group.step_norm),
+            _median(group.kl_divergence),
             f"{group.kl_divergence.max():.2g}",
-            *(_listed(getattr(ends.confirmed, part)()) for part in ("first", "last")),
+            *(_listed(getattr(runs.confirmed, end)()) for end in ("first", "last")),
         ]
-        lines.append(f"| {env} | {learner} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        body.append([env, learner, *cells])
+    return markdown(head, body)
 
 
-def _mean_of(runs: Any, part: str, n_updates: int = 3) -> float:
-    """Return the mean return over the first or last updates of the runs."""
-    return float(getattr(runs, part)(n_updates).mean_return.mean())
+def _median(values: pd.Series) -> str:
+    return "-" if values.isna().all() else f"{values.median():.2g}"
 
 
 def _listed(values: pd.Series) -> str:
-    return ", ".join(f"{value:.2g}" for value in values if not np.isnan(value)) or "-"
+    return ", ".join(f"{value:.2g}" for value in values.dropna()) or "-"
 
 
 def _draw(axis: Axes, rows: pd.DataFrame, column: str, title: str) -> None:

@@ -36,4 +36,4 @@ def test_an_update_is_recorded_with_what_it_learnt_from():
     assert -100 < row["mean_return"] < -20
     assert row["step_norm"] == pytest.approx(1e-3 * row["gradient_norm"], rel=1e-3)
     rows = pd.DataFrame([{"env": "Reacher-v5", "learner": "REINFORCE", "seed": 0} | row])
-    assert "| Reacher-v5 | REINFORCE | 1 |" in mujoco.table(rows)
+    assert "| Reacher-v5 | REINFORCE | 1 | 1 |" in mujoco.table(rows)
