@@ -146,8 +146,10 @@ class _Updates(BaseCallback):
 def draw(rows: pd.DataFrame) -> Figure:
     """Draw the learning curves and how far updates go, and print the table."""
     print(table(rows))
-    figure, axes = plt.subplots(2, 2, figsize=(9, 6.4), layout="constrained")
-    for row, env in zip(axes, TIMESTEPS, strict=True):
+    envs = [env for env in TIMESTEPS if env in set(rows.env)]
+    size = (9, 3.2 * len(envs))
+    figure, axes = plt.subplots(len(envs), 2, figsize=size, squeeze=False, layout="constrained")
+    for row, env in zip(axes, envs, strict=True):
         chosen = rows[rows.env == env]
         _draw(row[0], chosen, "mean_return", f"{env}: mean return of an update's episodes")
         _draw(row[1], chosen, "kl_divergence", f"{env}: KL divergence of an update")
