@@ -142,7 +142,7 @@ def ablation() -> str:
 
 
 def ranks() -> str:
-    """What several ranks gain and cost."""
+    """Return what several ranks gain and cost."""
     return "\n\n".join(distributed.tables(distributed.RESULTS.read()))
 
 
