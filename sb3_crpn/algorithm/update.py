@@ -248,6 +248,7 @@ class PolicyNewtonUpdate(RolloutAlgorithm):
         log_std = getattr(self.policy, "log_std", None)
         return {
             "n_updates": self._n_updates,
+            "mean_reward": self._mean_reward,
             "n_episodes": batch.total_episodes,
             "used_timesteps_fraction": self._used_fraction,
             "explained_variance": _explained_variance(batch),
@@ -271,7 +272,7 @@ def _step_statistics(
         "step_norm": float(step.step.norm()) if accepted else 0.0,
         "kl_divergence": step.kl if accepted else 0.0,
         "surrogate_change": change,
-        "policy_objective": -mean_cost - change * batch.total_episodes / batch.total_steps,
+        "policy_objective": -mean_cost - change * batch.total_size / batch.total_steps,
         "accepted": accepted,
         "certified": cubic.certified,
         "solver_status": cubic.status,
