@@ -61,6 +61,7 @@ def fit_critic(
         return float("nan")
     # not in training mode: a normalisation layer's statistics may be the actor's too
     policy.set_training_mode(False)
+    _follow_replaced(policy)
     layer = _output_layer(policy, actor)
     shift, scale = (0.0, 1.0) if layer is None else _units(batch, largest)
     dtype = next(policy.parameters()).dtype
@@ -91,6 +92,19 @@ def fuse(optimizer: torch.optim.Optimizer) -> None:
         unset = group["fused"] is None and group["foreach"] is None
         if unset and devices <= {"cpu", "cuda"}:
             group["fused"] = True
+
+
+def _follow_replaced(policy: ActorCriticPolicy) -> None:
+    """Let the optimiser hold the policy's parameters where layers of it were replaced."""
+    groups = policy.optimizer.param_groups
+    held = {id(parameter) for group in groups for parameter in group["params"]}
+    order = {id(parameter): index for index, parameter in enumerate(policy.parameters())}
+    if held <= order.keys():
+        return
+    for group in groups:
+        group["params"] = [p for p in group["params"] if id(p) in order]
+    groups[0]["params"] += [p for p in policy.parameters() if id(p) not in held]
+    groups[0]["params"].sort(key=lambda p: order[id(p)])  # a saved state lists them by position
 
 
 def _minibatches(
