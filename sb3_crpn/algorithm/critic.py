@@ -96,15 +96,18 @@ def fuse(optimizer: torch.optim.Optimizer) -> None:
 
 def _follow_replaced(policy: ActorCriticPolicy) -> None:
     """Let the optimiser hold the policy's parameters where layers of it were replaced."""
-    groups = policy.optimizer.param_groups
-    held = {id(parameter) for group in groups for parameter in group["params"]}
-    order = {id(parameter): index for index, parameter in enumerate(policy.parameters())}
-    if held <= order.keys():
+    optimizer = policy.optimizer
+    present = {parameter: index for index, parameter in enumerate(policy.parameters())}
+    held = {parameter for group in optimizer.param_groups for parameter in group["params"]}
+    if held <= present.keys():
         return
-    for group in groups:
-        group["params"] = [p for p in group["params"] if id(p) in order]
-    groups[0]["params"] += [p for p in policy.parameters() if id(p) not in held]
-    groups[0]["params"].sort(key=lambda p: order[id(p)])  # a saved state lists them by position
+    for gone in held - present.keys():
+        optimizer.state.pop(gone, None)
+    for group in optimizer.param_groups:
+        group["params"] = [p for p in group["params"] if p in present]
+    first = optimizer.param_groups[0]["params"]
+    first += [parameter for parameter in present if parameter not in held]
+    first.sort(key=present.__getitem__)  # a saved state lists them by position
 
 
 def _minibatches(
