@@ -104,6 +104,7 @@ class PolicyNewtonUpdate(RolloutAlgorithm):
         )
         self.last_update.write(self.logger)
 
+    @torch.enable_grad()
     def estimate_curvature(self, n_episodes: int, env: VecEnv | None = None) -> CurvatureEstimate:
         """Estimate gradient and Hessian of J at the current policy from fresh episodes.
 
