@@ -21,6 +21,7 @@ from benchmarks.learning import comparison, equal, store, tables
 from benchmarks.learning.comparison import Comparison
 from benchmarks.learning.settings import TRPO_EQUAL
 from benchmarks.learning.statistics import interquartile_mean, stratified_bootstrap
+from sb3_crpn.theory.__main__ import table as theory_table
 
 ROOT = Path(__file__).parents[1]
 LEARNING = Path(__file__).parent / "learning"
@@ -156,6 +157,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "headline": headline,
     "learners": learners,
     "published": published,
+    "theory": theory_table,
 }
 
 if __name__ == "__main__":
