@@ -10,7 +10,7 @@ import argparse
 from datetime import datetime
 from pathlib import Path
 
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from stable_baselines3.common.callbacks import EvalCallback
@@ -57,8 +57,8 @@ def train(run: Path, seed: int, timesteps: int) -> None:
 
 def draw(runs: list[Path], picture: Path) -> None:
     """Draw all runs' training episodes, their means over 100, and the evaluations."""
-    matplotlib.use("Agg")
-    figure, axes = matplotlib.pyplot.subplots(figsize=(7.0, 5.0), layout="constrained")
+    plt.switch_backend("Agg")
+    figure, axes = plt.subplots(figsize=(7.0, 5.0), layout="constrained")
     axes.axhline(SOLVED, color="gray", ls="--", lw=1, label=f"solved: {SOLVED}")
     for number, run in enumerate(runs):
         first = number == 0
