@@ -147,7 +147,7 @@ def ablation() -> str:
 
 
 def ranks() -> str:
-    """Return what several ranks gain and cost."""
+    """Return the times of several ranks and of one process, and the cost model."""
     return "\n\n".join(distributed.tables(distributed.RESULTS.read()))
 
 
