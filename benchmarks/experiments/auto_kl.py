@@ -1,0 +1,151 @@
+"""Training with steps as long as held-out episodes say, against the entry's ``target_kl``.
+
+    python -m benchmarks.experiments.auto_kl
+
+``entry`` is the environment's entry, its ``target_kl`` chosen by hand: its runs are those of
+`benchmarks.learning`, as far as the budget here goes. The other arms set the target of every update
+to c/2 (slope/curvature)² of the cross-fitted slope and curvature (`crossfit`), means in which the
+past fades by 0.9 an update, between a tenth and five times 0.02. CRPN's factor that shortens the
+steps of solved tasks stays: held-out episodes of a solved task confirm the critic's error, which
+does not depend on them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from benchmarks.experiments.confirmed import ConfirmedCRPN
+from benchmarks.experiments.study import PALETTE, Row, Study, interval
+from benchmarks.experiments.tasks import Returns, make_model
+from benchmarks.learning.settings import resolve
+from benchmarks.learning.store import RESULTS, read_curves
+from sb3_crpn.episodes import EpisodeBatch
+
+ENVS = ("CartPole-v1", "Pendulum-v1", "Acrobot-v1")
+BUDGET = 50_000
+FRACTIONS = {"c = 1": 1.0, "c = 0.2": 0.2}
+DEFAULT_KL = 0.02
+LOWEST, HIGHEST = 0.1, 5.0  # of the target, in terms of DEFAULT_KL
+MEMORY = 0.9  # by which the past fades in an update
+
+
+class AutoKL(ConfirmedCRPN):
+    """CRPN whose target is c/2 (slope/curvature)², confirmed by held-out episodes.
+
+    Parameters
+    ----------
+    fraction
+        c.
+    """
+
+    def __init__(self, *args: Any, fraction: float = 1.0, **kwargs: Any) -> None:
+        self._fraction = fraction
+        self._slope = self._curvature = 0.0  # fading sums
+        super().__init__(*args, **kwargs)
+
+    def _scaled_target_kl(self, batch: EpisodeBatch) -> float:
+        slope, curvature = self.records[-1]["slope"], self.records[-1]["curvature"]
+        if math.isfinite(slope):
+            self._slope = MEMORY * self._slope + slope
+            self._curvature = MEMORY * self._curvature + curvature
+        ratio = self._fraction * parabola_kl(self._slope, self._curvature) / DEFAULT_KL
+        scaled = super()._scaled_target_kl(batch)
+        assert scaled is not None
+        assert self.target_kl is not None
+        return DEFAULT_KL * min(HIGHEST, max(LOWEST, ratio)) * scaled / self.target_kl
+
+
+def parabola_kl(slope: float, curvature: float) -> float:
+    """Return ½ (slope/curvature)²; 0 where the cost does not fall, ∞ where it only falls."""
+    if slope <= 0.0:
+        return 0.0
+    return 0.5 * (slope / curvature) ** 2 if curvature > 0.0 else math.inf
+
+
+def jobs(seeds: int) -> list[Row]:
+    """Return one job per training run."""
+    return [
+        {"env": env, "arm": arm, "seed": seed}
+        for seed, arm, env in itertools.product(range(seeds), FRACTIONS, ENVS)
+    ]
+
+
+def measure(env: str, arm: str, seed: int) -> list[Row]:
+    """Train once."""
+    model = make_model(env, seed, AutoKL, target_kl=DEFAULT_KL, fraction=FRACTIONS[arm])
+    assert isinstance(model, AutoKL)
+    returns = Returns(BUDGET)
+    model.learn(BUDGET, callback=returns)
+    targets = [record["target_kl"] for record in model.records]
+    return [returns.summary() | {"median_target_kl": float(np.median(targets))}]
+
+
+def entry_rows(env: str, seeds: Sequence[int]) -> list[Row]:
+    """Return the rows of the entry's runs, from the first ``BUDGET`` steps of their curves."""
+    curves = read_curves(RESULTS)
+    rows = []
+    for seed in seeds:
+        chosen = (curves.algo == "CRPN") & (curves.env == env) & (curves.setting == "")
+        curve = curves[chosen & (curves.seed == seed) & (curves.steps <= BUDGET)]
+        late = curve[curve.steps > 0.8 * BUDGET]
+        rows.append(
+            {"env": env, "arm": "entry", "seed": seed}
+            | {"mean_return": curve["return"].mean(), "late_return": late["return"].mean()}
+            | {"median_target_kl": float(resolve("CRPN", env, {})[1].get("target_kl", DEFAULT_KL))}
+        )
+    return rows
+
+
+def table(rows: pd.DataFrame) -> str:
+    """Return a Markdown table: means over seeds with intervals."""
+    lines = [
+        "| task | target | mean return | of the last fifth | median target |",
+        "|---" * 5 + "|",
+    ]
+    for (env, arm), group in rows.groupby(["env", "arm"], sort=False):
+        cells = [
+            "{:.0f} [{:.0f}, {:.0f}]".format(*interval(group[name], statistic=np.mean))
+            for name in ("mean_return", "late_return")
+        ]
+        target = f"{group.median_target_kl.median():.3f}"
+        lines.append(f"| {env} | {arm} | {' | '.join(cells)} | {target} |")
+    return "\n".join(lines)
+
+
+def draw(rows: pd.DataFrame) -> Figure:
+    """Draw the mean returns, a panel a task; print the table."""
+    seeds = sorted(rows.seed.unique())
+    entries = pd.DataFrame([row for env in ENVS for row in entry_rows(env, seeds)])
+    rows = pd.concat([entries, rows], ignore_index=True).sort_values("env", kind="stable")
+    print(table(rows))
+    figure, axes = plt.subplots(1, len(ENVS), figsize=(9, 2.8), layout="constrained")
+    for axis, env in zip(axes, ENVS, strict=True):
+        _draw_means(axis, rows[rows.env == env])
+        axis.set_title(env, fontsize=9)
+    axes[0].set_ylabel("mean return over training")
+    return figure
+
+
+def _draw_means(axis: Axes, rows: pd.DataFrame) -> None:
+    arms = list(rows.arm.unique())
+    for position, (colour, arm) in enumerate(zip(PALETTE, arms, strict=False)):
+        values = rows[rows.arm == arm].mean_return
+        mean, low, high = interval(values, statistic=np.mean)
+        axis.errorbar(position, mean, [[mean - low], [high - mean]], fmt="o", color=colour)
+        axis.plot(np.full(len(values), position), values, ".", ms=3, color=colour, alpha=0.4)
+    axis.set_xticks(range(len(arms)), arms, fontsize=7)
+
+
+STUDY = Study("auto_kl", jobs, measure, draw, seeds=5)
+
+if __name__ == "__main__":
+    STUDY.main(str(__doc__))

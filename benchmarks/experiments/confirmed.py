@@ -1,0 +1,158 @@
+"""Whether confirmed slope and curvature tell how long a step should be.
+
+    python -m benchmarks.experiments.confirmed
+
+Training with an environment's entry, its steps untouched. Every update records, in standard
+deviations of the advantage per step of an episode and along a step of length √(sᵀFs) = 1:
+
+- slope and curvature of the natural-gradient step, cross-fitted (`crossfit`);
+- the slope that the *next* rollout finds along the step taken: a second witness, made from
+  independent episodes. It is positive if the step ended before the cost's minimum along it.
+
+The divergence ½ (slope/curvature)² of means over updates is where the cost along the step would be
+least, to second order. It is compared with the entry's ``target_kl``, chosen by hand.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from benchmarks.experiments.crossfit import CrossFit, confirm_natural_step
+from benchmarks.experiments.study import PALETTE, Row, Study, interval
+from benchmarks.experiments.tasks import Returns, make_model
+from sb3_crpn import CRPN
+from sb3_crpn.algorithm.step import PolicyStep
+from sb3_crpn.curvature import CurvatureEstimate, LocalModel
+from sb3_crpn.episodes import EpisodeBatch
+
+ENVS = ("CartPole-v1", "Pendulum-v1", "Acrobot-v1", "HalfCheetah-v5", "LunarLander-v3")
+BUDGET = 50_000
+
+
+def jobs(seeds: int) -> list[Row]:
+    """Return one job per training run."""
+    return [{"env": env, "seed": 10 + seed} for seed in range(seeds) for env in ENVS]
+
+
+def measure(env: str, seed: int) -> list[Row]:
+    """Train once; return a row per update."""
+    model = make_model(env, seed, ConfirmedCRPN)
+    assert isinstance(model, ConfirmedCRPN)
+    model.learn(BUDGET, callback=Returns(BUDGET))
+    return model.records
+
+
+class ConfirmedCRPN(CRPN):
+    """CRPN that records what held-out episodes say of each step.
+
+    Attributes
+    ----------
+    records
+        One row per update.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.records: list[Row] = []
+        self._last_step: Tensor | None = None
+        super().__init__(*args, **kwargs)
+
+    def _estimate(self, batch: EpisodeBatch, earlier: list[EpisodeBatch]) -> CurvatureEstimate:
+        folds = CrossFit(self, batch, earlier)
+        self._record_next_slope(folds.fresh_gradient)
+        record: Row = {"update": len(self.records), "timesteps": self.num_timesteps}
+        confirmed = confirm_natural_step(folds) if folds.n_folds > 1 else None
+        for name in ("claimed_slope", "slope", "curvature"):
+            record[name] = getattr(confirmed, name, float("nan"))
+        self.records.append(record)
+        return super()._estimate(batch, earlier)
+
+    def _record_next_slope(self, gradient: Tensor) -> None:
+        """Add to the last update what this rollout says of its step."""
+        if self._last_step is not None:
+            length = self.records[-1]["length"]
+            self.records[-1]["next_slope"] = -float(gradient @ self._last_step) / length
+
+    def _take_step(
+        self, batch: EpisodeBatch, model: LocalModel, target_kl: float | None
+    ) -> PolicyStep:
+        before = self.actor.vector
+        step = super()._take_step(batch, model, target_kl)
+        self._last_step = None if step.rejected else self.actor.vector - before
+        self.records[-1] |= {
+            "length": float("nan") if step.rejected else (2.0 * step.trial.kl) ** 0.5,
+            "target_kl": target_kl,
+            "next_slope": float("nan"),
+        }
+        return step
+
+
+def best_kl(rows: pd.DataFrame) -> float:
+    """Return ½ (slope / curvature)² of mean slope and curvature; 0, or ∞, where one is negative."""
+    slope, curvature = rows.slope.mean(), rows.curvature.mean()
+    if slope <= 0.0:
+        return 0.0
+    return float(0.5 * (slope / curvature) ** 2) if curvature > 0.0 else float("inf")
+
+
+def overshoot(rows: pd.DataFrame) -> float:
+    """Return the next rollout's slope along the steps taken, in terms of the confirmed one.
+
+    1: the slope has not changed; 0: the step ended at the minimum along it; -1: as far behind it.
+    """
+    return float(rows.next_slope.mean() / rows.slope.mean())
+
+
+def table(rows: pd.DataFrame) -> str:
+    """Return a Markdown table, a row per task and third of training; means over updates, seeds."""
+    lines = [
+        "| task | entry's target_kl | third | share of slope confirmed | slope | curvature "
+        "| ½ (slope / curvature)² | next slope / slope |",
+        "|---" * 8 + "|",
+    ]
+    for env, group in rows.groupby("env", sort=False):
+        third = (3 * group.timesteps / (BUDGET + 1)).astype(int).clip(upper=2)
+        for part, chosen in group.groupby(third):
+            share = chosen.slope.mean() / chosen.claimed_slope.mean()
+            cells = [
+                str(env),
+                f"{group.target_kl.max():g}",
+                f"{part + 1}",
+                f"{share:.2f}",
+                _mean(chosen, "slope"),
+                _mean(chosen, "curvature"),
+                f"{best_kl(chosen):.4f}",
+                f"{overshoot(chosen):.2f}",
+            ]
+            lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _mean(rows: pd.DataFrame, name: str) -> str:
+    return "{:.3f} [{:.3f}, {:.3f}]".format(*interval(rows[name].dropna(), statistic=np.mean))
+
+
+def draw(rows: pd.DataFrame) -> Figure:
+    """Draw the recommended divergence along training beside the entry's; print the table."""
+    print(table(rows))
+    figure, axes = plt.subplots(1, len(ENVS), figsize=(12, 2.8), sharey=True, layout="constrained")
+    for axis, (env, group) in zip(axes, rows.groupby("env", sort=False), strict=False):
+        for colour, (_, run) in zip(PALETTE, group.groupby("seed"), strict=False):
+            means = run[["slope", "curvature"]].ewm(alpha=0.1).mean()
+            ratio = means.slope.clip(lower=0.0) / means.curvature.clip(lower=1e-3)
+            axis.plot(run.timesteps, (0.5 * ratio**2).clip(1e-5, 10.0), lw=0.9, color=colour)
+        axis.axhline(group.target_kl.max(), color="k", ls=":", lw=1.0)
+        axis.set(yscale="log", title=env, xlabel="timesteps")
+    axes[0].set_ylabel("½ (slope / curvature)²; dotted: entry")
+    return figure
+
+
+STUDY = Study("confirmed", jobs, measure, draw, seeds=2)
+
+if __name__ == "__main__":
+    STUDY.main(str(__doc__))

@@ -1,0 +1,108 @@
+"""CRPN with H from other episodes than the update's, or as much of it as other episodes confirm."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import torch
+from stable_baselines3.common.env_util import make_vec_env
+from torch import Tensor
+
+from benchmarks.experiments.crossfit import CrossFit, Fold
+from benchmarks.experiments.steps import step_of_kl
+from sb3_crpn import CRPN
+from sb3_crpn.curvature import CurvatureEstimate
+from sb3_crpn.episodes import EpisodeBatch, concatenate
+
+MAX_ORACLE_ENVS = 16
+# ω from which the held-out value chooses
+OMEGAS = (0.0, 0.25, 0.5, 0.75, 1.0)
+MEMORY = 0.9  # by which the values of the past fade in an update
+
+
+class OracleHessian(CRPN):
+    """H from ``oracle_factor`` times as many fresh, independent episodes as the rollout has.
+
+    They are simulated in environments of their own, and counted nowhere: what a better estimate of
+    H would be worth, not a method. For environments without ``VecNormalize``.
+
+    Parameters
+    ----------
+    env_id, oracle_factor
+        The environment's registered name, and the factor.
+    """
+
+    def __init__(self, *args: Any, env_id: str, oracle_factor: int, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._factor = oracle_factor
+        self._oracle_env = make_vec_env(env_id, MAX_ORACLE_ENVS, seed=1000 + (self.seed or 0))
+
+    def _estimate(self, batch: EpisodeBatch, earlier: list[EpisodeBatch]) -> CurvatureEstimate:
+        fresh = self._collect_fresh(self._factor * batch.n_episodes, self._oracle_env)
+        return self._estimate_from(
+            concatenate([batch, *earlier]), self._episode_batch(fresh), batch
+        )
+
+
+class FreshHessian(CRPN):
+    """H from the fresh rollout alone, g from the earlier ones too."""
+
+    def _estimate(self, batch: EpisodeBatch, earlier: list[EpisodeBatch]) -> CurvatureEstimate:
+        return self._estimate_from(concatenate([batch, *earlier]), batch, batch)
+
+
+class ConfirmedHessian(CRPN):
+    """ω, and whether earlier rollouts join H, by the step's value on episodes that did not make it.
+
+    The value of a choice is the mean over folds of -(g·s + ½ sᵀHs), g and H the fold's, s made from
+    all other episodes with that choice and ``target_kl``; and over updates, the past fading.
+
+    Attributes
+    ----------
+    values
+        The mean values so far, by (source, ω).
+    choice
+        The (source, ω) of the last update.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.values: dict[tuple[str, float], float] = {}
+        self.choice = ("all", 0.0)
+        super().__init__(*args, **kwargs)
+
+    def _estimate(self, batch: EpisodeBatch, earlier: list[EpisodeBatch]) -> CurvatureEstimate:
+        if batch.n_episodes > 1:
+            self._judge(CrossFit(self, batch, earlier))
+            self.choice = max(self.values, key=self.values.__getitem__)
+        source, self.hessian_shrinkage = self.choice
+        gradient_batch = concatenate([batch, *earlier])
+        return self._estimate_from(
+            gradient_batch, gradient_batch if source == "all" else batch, batch
+        )
+
+    def _judge(self, folds: CrossFit) -> None:
+        """Let this rollout's values fade into the means."""
+        total: dict[tuple[str, float], float] = {}
+        for fold in folds:
+            for choice, value in self._fold_values(folds, fold).items():
+                total[choice] = total.get(choice, 0.0) + fold.weight * value
+        for choice, value in total.items():
+            past = self.values.get(choice, value)
+            self.values[choice] = MEMORY * past + (1.0 - MEMORY) * value
+
+    def _fold_values(self, folds: CrossFit, fold: Fold) -> dict[tuple[str, float], float]:
+        assert self.target_kl is not None
+        forms, k = folds.hessian_forms(fold), fold.index
+        test = forms[k] / folds.sizes[k]
+        values = {}
+        for source, omega in itertools.product(("all", "fresh"), OMEGAS):
+            groups = slice(None) if source == "all" else slice(folds.n_folds)
+            rest = (forms[groups].sum(0) - forms[k]) / (folds.sizes[groups].sum() - folds.sizes[k])
+            y = step_of_kl(fold.gradient, omega * rest, fold.space, self.target_kl)
+            values[source, omega] = _gain(fold.test_gradient, test, y)
+        return values
+
+
+def _gain(gradient: Tensor, hessian: Tensor, y: Tensor) -> float:
+    return -float(gradient @ y + 0.5 * torch.dot(y, hessian @ y))
