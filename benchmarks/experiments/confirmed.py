@@ -15,6 +15,7 @@ least, to second order. It is compared with the entry's ``target_kl``, chosen by
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -92,28 +93,25 @@ class ConfirmedCRPN(CRPN):
         return step
 
 
-def best_kl(rows: pd.DataFrame) -> float:
-    """Return ½ (slope / curvature)² of mean slope and curvature; 0, or ∞, where one is negative."""
-    slope, curvature = rows.slope.mean(), rows.curvature.mean()
+def parabola_kl(slope: float, curvature: float) -> float:
+    """Return ½ (slope/curvature)²; 0 where the cost does not fall, ∞ where it only falls."""
     if slope <= 0.0:
         return 0.0
-    return float(0.5 * (slope / curvature) ** 2) if curvature > 0.0 else float("inf")
+    return 0.5 * (slope / curvature) ** 2 if curvature > 0.0 else math.inf
 
 
-def overshoot(rows: pd.DataFrame) -> float:
-    """Return the next rollout's slope along the steps taken, in terms of the confirmed one.
-
-    1: the slope has not changed; 0: the step ended at the minimum along it; -1: as far behind it.
-    """
-    return float(rows.next_slope.mean() / rows.slope.mean())
+def secant_curvature(rows: pd.DataFrame) -> float:
+    """Return the curvature that the next rollouts' slopes speak of, by least squares."""
+    drop = rows.slope - rows.next_slope
+    return float((rows.length * drop).sum() / (rows.length**2)[drop.notna()].sum())
 
 
 def table(rows: pd.DataFrame) -> str:
     """Return a Markdown table, a row per task and third of training; means over updates, seeds."""
     lines = [
-        "| task | entry's target_kl | third | share of slope confirmed | slope | curvature "
-        "| ½ (slope / curvature)² | next slope / slope |",
-        "|---" * 8 + "|",
+        "| task | entry's target_kl | third | share of slope confirmed | slope "
+        "| curvature, cross-fitted | its KL | curvature, secant | its KL |",
+        "|---" * 9 + "|",
     ]
     for env, group in rows.groupby("env", sort=False):
         third = (3 * group.timesteps / (BUDGET + 1)).astype(int).clip(upper=2)
@@ -126,8 +124,9 @@ def table(rows: pd.DataFrame) -> str:
                 f"{share:.2f}",
                 _mean(chosen, "slope"),
                 _mean(chosen, "curvature"),
-                f"{best_kl(chosen):.4f}",
-                f"{overshoot(chosen):.2f}",
+                f"{parabola_kl(chosen.slope.mean(), chosen.curvature.mean()):.3f}",
+                f"{secant_curvature(chosen):.3f}",
+                f"{parabola_kl(chosen.slope.mean(), secant_curvature(chosen)):.3f}",
             ]
             lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
@@ -142,14 +141,31 @@ def draw(rows: pd.DataFrame) -> Figure:
     print(table(rows))
     figure, axes = plt.subplots(1, len(ENVS), figsize=(12, 2.8), sharey=True, layout="constrained")
     for axis, (env, group) in zip(axes, rows.groupby("env", sort=False), strict=False):
-        for colour, (_, run) in zip(PALETTE, group.groupby("seed"), strict=False):
-            means = run[["slope", "curvature"]].ewm(alpha=0.1).mean()
-            ratio = means.slope.clip(lower=0.0) / means.curvature.clip(lower=1e-3)
-            axis.plot(run.timesteps, (0.5 * ratio**2).clip(1e-5, 10.0), lw=0.9, color=colour)
-        axis.axhline(group.target_kl.max(), color="k", ls=":", lw=1.0)
-        axis.set(yscale="log", title=env, xlabel="timesteps")
-    axes[0].set_ylabel("½ (slope / curvature)²; dotted: entry")
+        for style, (_, run) in zip(("-", "--"), group.groupby("seed"), strict=False):
+            for colour, (name, kls) in zip(PALETTE, recommendations(run).items(), strict=False):
+                axis.plot(run.timesteps, kls.clip(1e-4, 1.0), style, color=colour, label=name)
+        axis.axhline(group.target_kl.max(), color="k", ls=":", lw=1.0, label="entry")
+        axis.set(yscale="log", xlabel="timesteps")
+        axis.set_title(env, fontsize=9)
+    axes[0].set_ylabel("½ (slope / curvature)²")
+    axes[0].legend(fontsize=7)
     return figure
+
+
+def recommendations(run: pd.DataFrame) -> dict[str, pd.Series]:
+    """Return ½ (slope/curvature)² of fading means along a run, by the witness of the curvature."""
+    drop = run.length * (run.slope - run.next_slope)
+    squares = (run.length**2).where(drop.notna())
+    curvatures = {
+        "cross-fitted": _faded(run.curvature),
+        "secant": _faded(drop) / _faded(squares),
+    }
+    slope = _faded(run.slope).clip(lower=0.0)
+    return {name: 0.5 * (slope / c.clip(lower=1e-3)) ** 2 for name, c in curvatures.items()}
+
+
+def _faded(values: pd.Series) -> pd.Series:
+    return values.ewm(alpha=0.1).mean()
 
 
 STUDY = Study("confirmed", jobs, measure, draw, seeds=2)

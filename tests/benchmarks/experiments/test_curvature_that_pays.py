@@ -16,8 +16,13 @@ from benchmarks.exact import (
     random_mdp,
 )
 from benchmarks.experiments import auto_kl, heldout, oracle
-from benchmarks.experiments.auto_kl import AutoKL, parabola_kl
-from benchmarks.experiments.confirmed import ConfirmedCRPN, best_kl, overshoot
+from benchmarks.experiments.auto_kl import AutoKL
+from benchmarks.experiments.confirmed import (
+    ConfirmedCRPN,
+    parabola_kl,
+    recommendations,
+    secant_curvature,
+)
 from benchmarks.experiments.crossfit import CrossFit, confirm_natural_step
 from benchmarks.experiments.hessians import ConfirmedHessian, FreshHessian, OracleHessian
 from benchmarks.experiments.steps import Subspace, fisher_subspace, step_of_kl
@@ -175,12 +180,17 @@ def test_training_records_what_is_confirmed_and_what_the_next_rollout_says():
     assert torch.equal(model.actor.vector, plain.actor.vector)  # nothing is disturbed
 
 
-def test_the_best_divergence_is_that_of_a_parabola():
-    rows = pd.DataFrame({"slope": [0.1, 0.3], "curvature": [0.5, 1.5], "next_slope": [0.1, -0.1]})
-    assert best_kl(rows) == pytest.approx(0.5 * 0.2**2)
-    assert overshoot(rows) == 0.0
-    assert best_kl(-rows) == 0.0
-    assert best_kl(rows.assign(curvature=-1.0)) == np.inf
+def test_a_parabola_is_recognised_by_its_secants_and_so_is_where_it_is_least():
+    assert parabola_kl(0.2, 0.5) == pytest.approx(0.08)
+    assert parabola_kl(-0.2, 0.5) == 0.0
+    assert parabola_kl(0.2, -0.5) == np.inf
+    lengths = np.array([0.1, 0.2, 0.3])
+    rows = pd.DataFrame({"length": lengths, "slope": 0.2, "next_slope": 0.2 - 0.5 * lengths})
+    rows = rows.assign(curvature=0.5)
+    rejected = pd.DataFrame({"slope": [0.2], "length": [np.nan], "next_slope": [np.nan]})
+    assert secant_curvature(pd.concat([rows, rejected])) == pytest.approx(0.5)
+    for kls in recommendations(rows).values():
+        assert kls.tolist() == pytest.approx([0.08] * 3)
 
 
 def test_the_oracle_knows_the_hessian_better():
@@ -240,22 +250,25 @@ def test_runs_of_the_oracle_study_differ_in_the_hessian_alone(monkeypatch):
 
 
 def test_targets_follow_what_is_confirmed():
-    assert parabola_kl(0.2, 0.5) == pytest.approx(0.08)
-    assert parabola_kl(-0.2, 0.5) == 0.0
-    assert parabola_kl(0.2, -0.5) == np.inf
-    model = make_learner(AutoKL, fraction=0.5).learn(MDP.horizon * 8 * 5)
-    slope = curvature = 0.0
-    for record in model.records:  # the returns of this process never lose their spread
-        slope, curvature = (
-            0.9 * past + record[name] for past, name in ((slope, "slope"), (curvature, "curvature"))
-        )
-        expected = min(0.1, max(0.002, 0.5 * parabola_kl(slope, curvature)))
-        assert record["target_kl"] == pytest.approx(expected)
+    model = make_learner(AutoKL, fraction=0.5).learn(MDP.horizon * 8 * 6)
+    records = pd.DataFrame(model.records)
+    targets = [0.02]
+    for k in range(1, len(records)):
+        past = records[:k]
+        faded = 0.9 ** np.arange(k - 1, -1, -1)  # of the secants, the last one new
+        curvature = (faded * past.length * (past.slope - past.next_slope)).sum() / (
+            faded * past.length**2
+        ).sum()
+        slope = np.average(records.slope[: k + 1], weights=0.9 ** np.arange(k, -1, -1))
+        targets.append(min(0.1, max(0.002, 0.5 * parabola_kl(slope, curvature))))
+    assert records.target_kl.tolist() == pytest.approx(targets)
 
 
 def test_the_entrys_runs_are_cut_at_the_budget():
     (row,) = auto_kl.entry_rows("CartPole-v1", [0])
     curves = read_curves(RESULTS)
     curve = curves[(curves.algo == "CRPN") & (curves.env == "CartPole-v1") & (curves.seed == 0)]
-    assert row["mean_return"] == pytest.approx(curve["return"][curve.steps <= 50_000].mean())
+    assert row["mean_return"] == pytest.approx(
+        curve["return"][curve.steps <= auto_kl.BUDGET].mean()
+    )
     assert row["median_target_kl"] == 0.01
