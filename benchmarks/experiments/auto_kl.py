@@ -83,7 +83,7 @@ def jobs(seeds: int) -> list[Row]:
     """Return one job per training run."""
     return [
         {"env": env, "arm": arm, "seed": seed}
-        for arm, seed, env in itertools.product(FRACTIONS, range(seeds), ENVS)
+        for arm, env, seed in itertools.product(FRACTIONS, ENVS, range(seeds))
     ]
 
 
