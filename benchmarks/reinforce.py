@@ -2,63 +2,27 @@
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any
-
-import torch
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_crpn.algorithm import PolicyNewtonAlgorithm
-from sb3_crpn.algorithm.arguments import check_real, check_schedule, inherits_arguments
+from sb3_crpn.algorithm.declaration import configured, setting
+from sb3_crpn.algorithm.settings import CheckedSchedule
+from sb3_crpn.algorithm.solvers import SubproblemSolver
+from sb3_crpn.checks import NONE, POSITIVE, SCHEDULE, choice, real
 from sb3_crpn.cubic import CubicStep
-from sb3_crpn.curvature import CurvatureEstimate, LocalModel
+from sb3_crpn.curvature import LocalModel
+from sb3_crpn.episodes import EpisodeBatch
 
 
-class REINFORCE(PolicyNewtonAlgorithm):
-    """θ ← θ - η g, with the gradient estimate g of the policy Newton algorithms.
+class GradientStep:
+    """s = -g/α, α = 1/η."""
 
-    The step minimises g·s + ‖s‖²/(2η): no Hessian, no metric, no bound on the divergence. Episodes,
-    advantages and critic are those of CRPN.
+    def needs_matrix(self, dim: int) -> bool:
+        """Return False."""
+        return False
 
-    Parameters
-    ----------
-    actor_learning_rate
-        η > 0, a float or a schedule. (``learning_rate`` is the critic's, as in CRPN.)
-    **arguments
-        Those of :class:`~sb3_crpn.algorithm.PolicyNewtonAlgorithm` but ``alpha``, ``target_kl``,
-        ``metric``, ``hessian_shrinkage`` and ``n_hessian_episodes``, which have no meaning here.
-    """
-
-    @inherits_arguments(PolicyNewtonAlgorithm)
-    def __init__(
-        self, *args: Any, actor_learning_rate: float | Schedule = 1e-2, **arguments: Any
-    ) -> None:
-        self.actor_learning_rate = actor_learning_rate
-        super().__init__(
-            *args, target_kl=None, metric="euclidean", hessian_shrinkage=None, **arguments
-        )
-
-    def _setup_model(self) -> None:
-        positive = partial(check_real, low=0.0, open_low=True)
-        check_schedule("actor_learning_rate", self.actor_learning_rate, positive)
-        super()._setup_model()
-        rate = FloatSchedule(self.actor_learning_rate)
-        self.alpha_schedule = lambda progress: 1.0 / rate(progress)
-
-    def _local_model(self, estimate: CurvatureEstimate) -> LocalModel:
-        return LocalModel(
-            gradient=estimate.gradient,
-            hessian=None,
-            product=torch.zeros_like,
-            basis=None,
-            shrinkage=0.0,
-            lambda_min=float("nan"),
-            products=0,
-        )
-
-    def _solve(self, model: LocalModel, alpha: float) -> CubicStep:
-        """Return s = -g/α with α = 1/η."""
+    def solve(self, model: LocalModel, alpha: float) -> CubicStep:
+        """Minimise g·s + (α/2)‖s‖²."""
         step = -model.gradient / alpha
         return CubicStep(
             step=step,
@@ -69,3 +33,36 @@ class REINFORCE(PolicyNewtonAlgorithm):
             certified=True,
             status="gradient step",
         )
+
+
+@configured
+class REINFORCE(PolicyNewtonAlgorithm):
+    """θ ← θ - η g, with the gradient estimate g of the policy Newton algorithms.
+
+    The step minimises g·s + ‖s‖²/(2η): no Hessian, no metric, no bound on the divergence. Episodes,
+    advantages and critic are those of CRPN.
+
+    {parameters}
+    """
+
+    actor_learning_rate: float | Schedule = setting(
+        POSITIVE | SCHEDULE,
+        "η > 0, a float or a schedule. (``learning_rate`` is the critic's, as in CRPN.)",
+        1e-2,
+    )
+    target_kl: None = setting(NONE, "Not used.", None)
+    metric: str = setting(choice("euclidean"), "Not used.", "euclidean")
+    hessian_shrinkage: float = setting(real(0.0, 0.0), "No Hessian.", 0.0)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        name = f"{type(self).__name__}: actor_learning_rate"
+        rate = CheckedSchedule(name, self.actor_learning_rate, POSITIVE)
+        self.alpha_schedule = CheckedSchedule(
+            f"{type(self).__name__}: 1/actor_learning_rate",
+            lambda progress: 1.0 / rate(progress),
+            POSITIVE,
+        )
+
+    def _update_solver(self, batch: EpisodeBatch) -> SubproblemSolver:
+        return GradientStep()

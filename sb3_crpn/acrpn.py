@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from stable_baselines3.common.buffers import RolloutBuffer
@@ -11,18 +10,13 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_crpn.algorithm import PolicyNewtonAlgorithm
-from sb3_crpn.algorithm.arguments import (
-    check_flag,
-    check_integer,
-    check_optional,
-    check_real,
-    inherits_arguments,
-)
-from sb3_crpn.cubic import CubicStep, cubic_finalsolver, cubic_subsolver
-from sb3_crpn.curvature import CurvatureEstimate, LocalModel
-from sb3_crpn.distributed import broadcast
+from sb3_crpn.algorithm.declaration import configured, setting
+from sb3_crpn.algorithm.solvers import ApproximateSolver, SubproblemSolver
+from sb3_crpn.checks import COUNT, FLAG, NONE, POSITIVE, choice
+from sb3_crpn.episodes import EpisodeBatch
 
 
+@configured
 class ACRPN(PolicyNewtonAlgorithm):
     """Approximate Cubic-Regularised Policy Newton: a Cauchy step or gradient descent on the model.
 
@@ -31,52 +25,27 @@ class ACRPN(PolicyNewtonAlgorithm):
     Cubic-Finalsolver. With ``target_kl=None`` and the Euclidean metric they work on products with
     the whole Hessian, else on the Krylov space.
 
-    Parameters
-    ----------
-    gradient_lipschitz
-        ℓ, a bound on ‖∇²J‖; "auto": ‖H‖, estimated in each update.
-    sosp_epsilon
-        ε > 0 of second-order stationarity.
-    subsolver_steps
-        N̂, at most so many iterations of either inner gradient descent; ``None``: ℓ/√(ρε) times a
-        logarithm, as the theory has it, up to 10,000. The paper's algorithm needs ``None``.
-    stop_at_sosp
-        End training when the predicted decrease says ε-SOSP, as the paper's Algorithm 2 does.
-    **arguments
-        Those of :class:`~sb3_crpn.algorithm.PolicyNewtonAlgorithm`.
+    {parameters}
     """
 
-    @inherits_arguments(PolicyNewtonAlgorithm)
-    def __init__(
-        self,
-        *args: Any,
-        gradient_lipschitz: float | Literal["auto"] = "auto",
-        sosp_epsilon: float = 1e-2,
-        subsolver_steps: int | None = 50,
-        stop_at_sosp: bool = False,
-        **arguments: Any,
-    ) -> None:
-        self.gradient_lipschitz = gradient_lipschitz
-        self.sosp_epsilon = sosp_epsilon
-        self.subsolver_steps = subsolver_steps
-        self.stop_at_sosp = stop_at_sosp
-        self._at_sosp = False
-        super().__init__(*args, **arguments)
-
-    def _setup_model(self) -> None:
-        if self.gradient_lipschitz != "auto":
-            try:
-                check_real("gradient_lipschitz", self.gradient_lipschitz, 0.0, open_low=True)
-            except ValueError as error:
-                raise ValueError(f'{error}, or "auto"') from None
-        check_real("sosp_epsilon", self.sosp_epsilon, 0.0, open_low=True)
-        check_optional("subsolver_steps", self.subsolver_steps, lambda n, v: check_integer(n, v, 1))
-        check_flag("stop_at_sosp", self.stop_at_sosp)
-        super()._setup_model()
-
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        self._at_sosp = False
-        return super()._setup_learn(*args, **kwargs)
+    gradient_lipschitz: float | Literal["auto"] = setting(
+        POSITIVE | choice("auto"),
+        'ℓ, a bound on ‖∇²J‖; "auto": ‖H‖, estimated in each update.',
+        "auto",
+    )
+    sosp_epsilon: float = setting(POSITIVE, "ε > 0 of second-order stationarity.", 1e-2)
+    subsolver_steps: int | None = setting(
+        COUNT | NONE,
+        "N̂, the maximum number of iterations of either inner gradient descent; ``None``: ℓ/√(ρε) "
+        "times a logarithm, as the theory has it, up to 10,000. The paper's algorithm needs "
+        "``None``.",
+        50,
+    )
+    stop_at_sosp: bool = setting(
+        FLAG,
+        "End training when the predicted decrease says ε-SOSP, as the paper's Algorithm 2 does.",
+        False,
+    )
 
     def collect_rollouts(
         self,
@@ -86,41 +55,16 @@ class ACRPN(PolicyNewtonAlgorithm):
         n_rollout_steps: int,
     ) -> bool:
         """Collect whole episodes, unless the last update found an ε-SOSP and is to be the last."""
-        if self.stop_at_sosp and bool(broadcast(torch.tensor(self._at_sosp))):
+        if self.stop_at_sosp and self.last_update is not None and self.last_update.at_sosp:
             return False
         return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
 
-    def _local_model(self, estimate: CurvatureEstimate) -> LocalModel:
-        # one perturbation an update, whatever α is tried
-        self._perturbation_seed = int(broadcast(torch.tensor(self._rng.integers(2**31))))
-        return super()._local_model(estimate)
-
-    def _solve(self, model: LocalModel, alpha: float) -> CubicStep:
-        lipschitz = self._lipschitz(model)
-        cubic = cubic_subsolver(
-            model.gradient,
-            model.product,
-            alpha,
-            gradient_lipschitz=lipschitz,
-            epsilon=self.sosp_epsilon,
-            max_steps=self.subsolver_steps,
-            seed=self._perturbation_seed,
+    def _update_solver(self, batch: EpisodeBatch) -> SubproblemSolver:
+        seed = batch.agreed(torch.tensor(self._rng.integers(2**31)))
+        lipschitz = self.gradient_lipschitz
+        return ApproximateSolver(
+            None if isinstance(lipschitz, str) else lipschitz,
+            self.sosp_epsilon,
+            self.subsolver_steps,
+            int(seed),
         )
-        enough = math.sqrt(self.sosp_epsilon**3 / alpha) / 100.0
-        self._at_sosp = cubic.predicted_decrease <= enough
-        if not self._at_sosp:
-            return cubic
-        return cubic_finalsolver(
-            model.gradient,
-            model.product,
-            alpha,
-            gradient_lipschitz=lipschitz,
-            epsilon=self.sosp_epsilon,
-            max_steps=self.subsolver_steps,
-        )
-
-    def _lipschitz(self, model: LocalModel) -> float | None:
-        if self.gradient_lipschitz != "auto":
-            return self.gradient_lipschitz
-        # None: the subsolver estimates it by products
-        return None if model.hessian is None else float(torch.linalg.matrix_norm(model.hessian, 2))

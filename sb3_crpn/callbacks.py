@@ -9,6 +9,7 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_crpn.algorithm import PolicyNewtonAlgorithm
+from sb3_crpn.checks import FLAG, NONE, PATH, VERBOSE, integer
 
 
 class RandomIterateCallback(BaseCallback):
@@ -34,6 +35,11 @@ class RandomIterateCallback(BaseCallback):
     verbose
         1: print R and N when training ends.
 
+    Raises
+    ------
+    ValueError
+        An argument is out of range.
+
     Attributes
     ----------
     iteration
@@ -52,13 +58,14 @@ class RandomIterateCallback(BaseCallback):
         seed: int | None = None,
         verbose: int = 0,
     ) -> None:
-        super().__init__(verbose)
-        self.save_path = save_path
-        self.assign = assign
+        name = type(self).__name__
+        super().__init__(VERBOSE(f"{name}: verbose", verbose))
+        self.save_path: str | Path | None = (PATH | NONE)(f"{name}: save_path", save_path)
+        self.assign: bool = FLAG(f"{name}: assign", assign)
         self.iteration: int | None = None
         self.n_iterations = 0
         self.parameters: dict[str, torch.Tensor] = {}
-        self._rng = np.random.default_rng(seed)
+        self._rng = np.random.default_rng((integer(0) | NONE)(f"{name}: seed", seed))
         self._total_weight = 0.0
         self._updates_seen = 0
 
@@ -104,9 +111,9 @@ class RandomIterateCallback(BaseCallback):
             self.parameters = _copy(self.model.policy)
 
     def _weight(self) -> float:
-        """Return α_k of the last update, whose log has not been dumped yet."""
-        if isinstance(self.model, PolicyNewtonAlgorithm):
-            return float(self.logger.name_to_value["train/alpha"])
+        """Return α_k of the last update."""
+        if isinstance(self.model, PolicyNewtonAlgorithm) and self.model.last_update is not None:
+            return self.model.last_update.alpha
         return 1.0
 
 

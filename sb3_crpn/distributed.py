@@ -6,20 +6,18 @@ docs/DISTRIBUTED.md says how a run is started and what is shared.
 
 from __future__ import annotations
 
-import argparse
 import atexit
 import importlib
 import os
-import sys
-import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import timedelta
 
 import numpy as np
-import numpy.typing as npt
 import torch
 import torch.distributed as dist
+
+from sb3_crpn.arrays import FloatArray
 
 # How long a rank waits for the others: longer than any evaluation that rank 0 makes alone. A rank
 # whose process ends is noticed at once.
@@ -159,7 +157,7 @@ def gather_counts(count: int) -> list[int]:
     return [int(number) for number in all_sum(counts)]
 
 
-def mean_and_variance(values: npt.NDArray[np.float64]) -> tuple[float, float]:
+def mean_and_variance(values: FloatArray) -> tuple[float, float]:
     """Return mean and variance (of the population) of the union of the ranks' arrays [n]."""
     count, total = all_sum(torch.tensor([len(values), values.sum()], dtype=torch.float64)).tolist()
     mean = total / count
@@ -181,36 +179,3 @@ def rank_seed(seed: int, *more: int) -> int:
     if rank() == 0:
         return seed
     return int(np.random.SeedSequence((seed, rank(), *more)).generate_state(1)[0])
-
-
-def zoo_options(options: Sequence[str]) -> list[str]:
-    """Join the run that ``torchrun`` started and return this rank's options for rl-zoo's ``train``.
-
-    All ranks get the seed of rank 0. The others print nothing, evaluate nothing, and write below a
-    temporary folder of their own. Without ``torchrun`` the options stay as they are.
-
-    Raises
-    ------
-    ValueError
-        A search for hyperparameters is asked for: its trials are independent runs.
-    """
-    init_from_env()
-    if world_size() == 1:
-        return list(options)
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--seed", type=int, default=-1)
-    parser.add_argument("-optimize", "--optimize-hyperparameters", action="store_true")
-    parsed = parser.parse_known_args(options)[0]
-    if parsed.optimize_hyperparameters:
-        raise ValueError(
-            "-optimize is not allowed with torchrun: start several processes that share a "
-            "--storage and a --study-name"
-        )
-    seed = parsed.seed if parsed.seed >= 0 else int(np.random.default_rng().integers(2**32))
-    quiet: Iterable[str] = ()
-    if rank() > 0:
-        folder = tempfile.TemporaryDirectory()
-        atexit.register(folder.cleanup)
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 until the process ends
-        quiet = ("--log-folder", folder.name, "--eval-freq", "-1", "--save-freq", "-1")
-    return [*options, "--seed", str(int(broadcast(torch.tensor(seed)))), *quiet]

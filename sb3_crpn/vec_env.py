@@ -11,7 +11,6 @@ import numpy as np
 from gymnasium.envs.classic_control.cartpole import CartPoleVectorEnv
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from gymnasium.wrappers import vector as wrappers
-from numpy.typing import NDArray
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
@@ -19,8 +18,9 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices as Indic
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 from stable_baselines3.common.vec_env.util import dict_to_obs, obs_space_info
 
+from sb3_crpn.arrays import Array
+
 AnyVectorEnv: TypeAlias = VectorEnv[Any, Any, Any]
-Array: TypeAlias = NDArray[Any]
 Info: TypeAlias = dict[str, Any]
 Infos: TypeAlias = list[Info]
 Leaves: TypeAlias = dict[Any, Array]

@@ -8,16 +8,21 @@ it is optional, and it patches Gymnasium's ``TimeLimit``.
 from __future__ import annotations
 
 import argparse
+import atexit
+import os
 import sys
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterable, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_crpn import ACRPN, CRPN
-from sb3_crpn.distributed import zoo_options
+from sb3_crpn.distributed import broadcast, init_from_env, rank, world_size
 
 if TYPE_CHECKING:
     from optuna import Trial
@@ -65,6 +70,39 @@ def register() -> None:
     ALGOS.update(ALGORITHMS)
     HYPERPARAMS_SAMPLER.update(crpn=sample_crpn_params, acrpn=sample_acrpn_params)
     HYPERPARAMS_CONVERTER.update(dict.fromkeys(ALGORITHMS, convert_onpolicy_params))
+
+
+def zoo_options(options: Sequence[str]) -> list[str]:
+    """Join the run that ``torchrun`` started and return this rank's options for rl-zoo's ``train``.
+
+    All ranks get the seed of rank 0. The others print nothing, evaluate nothing, and write below a
+    temporary folder of their own. Without ``torchrun`` the options stay as they are.
+
+    Raises
+    ------
+    ValueError
+        A search for hyperparameters is asked for: its trials are independent runs.
+    """
+    init_from_env()
+    if world_size() == 1:
+        return list(options)
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--seed", type=int, default=-1)
+    parser.add_argument("-optimize", "--optimize-hyperparameters", action="store_true")
+    parsed = parser.parse_known_args(options)[0]
+    if parsed.optimize_hyperparameters:
+        raise ValueError(
+            "-optimize is not allowed with torchrun: start several processes that share a "
+            "--storage and a --study-name"
+        )
+    seed = parsed.seed if parsed.seed >= 0 else int(np.random.default_rng().integers(2**32))
+    quiet: Iterable[str] = ()
+    if rank() > 0:
+        folder = tempfile.TemporaryDirectory()
+        atexit.register(folder.cleanup)
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 until the process ends
+        quiet = ("--log-folder", folder.name, "--eval-freq", "-1", "--save-freq", "-1")
+    return [*options, "--seed", str(int(broadcast(torch.tensor(seed)))), *quiet]
 
 
 def config_file(name: str) -> Path:

@@ -6,6 +6,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
+from sb3_crpn.curvature import Causal, Trajectory
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.episodes.batch import episode_starts
 from sb3_crpn.parameters import ActorParameters
@@ -67,6 +68,8 @@ def frozen_episodes(policy, lengths=(3, 1, 4, 2), seed=0):
         rewards=rng.normal(size=n_steps),
         log_probs=rng.normal(size=n_steps),
         terminal_values=rng.normal(size=len(lengths)),
+        times=np.zeros(len(lengths), dtype=int),
+        trajectories=np.arange(len(lengths)),
     )
 
 
@@ -99,6 +102,14 @@ def log_hessians(policy, actor, batch):
         score = flat_gradient(log_prob, actor, create_graph=True)
         hessians.append(torch.stack([flat_gradient(entry, actor) for entry in score]))
     return torch.stack(hessians)
+
+
+ESTIMATORS = [("trajectory", 1.0), *(("causal", decay) for decay in (0.0, 0.5, 0.9, 1.0))]
+
+
+def estimator_of(name, decay=1.0):
+    """The Hessian estimator of DESIGN section 2."""
+    return Trajectory() if name == "trajectory" else Causal(decay)
 
 
 def pair_matrix(estimator, decay, weights):

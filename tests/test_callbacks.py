@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -80,7 +82,7 @@ def draw(model, alphas, seed):
     for alpha in alphas:
         callback.on_rollout_start()
         model._n_updates += 1
-        model.logger.record("train/alpha", alpha)
+        model.last_update = SimpleNamespace(alpha=alpha)
     callback.on_training_end()
     return callback.iteration
 

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_crpn import ACRPN, CRPN, PAPER
 from sb3_crpn.algorithm import update
+from sb3_crpn.algorithm.solvers import SubproblemSolver
 from sb3_crpn.cubic import solve_dense
 from tests.envs import Drift, Sampler
 from tests.oracle import paper_estimates
@@ -135,11 +137,12 @@ class Batches:
         self.estimate = update.estimate_curvature
         monkeypatch.setattr(update, "estimate_curvature", self)
 
-    def __call__(self, policy, actor, gradient_batch, hessian_batch, *rest):
-        self.sizes.append((gradient_batch.n_episodes, hessian_batch.n_episodes))
-        self.observations.append((gradient_batch.observations, hessian_batch.observations))
-        self.of_fisher.append(rest[-1].n_episodes)
-        return self.estimate(policy, actor, gradient_batch, hessian_batch, *rest)
+    def __call__(self, policy, actor, batch, estimator, **options):
+        hessian_batch = options["hessian_batch"] or batch
+        self.sizes.append((batch.n_episodes, hessian_batch.n_episodes))
+        self.observations.append((batch.observations, hessian_batch.observations))
+        self.of_fisher.append((options["fisher_batch"] or batch).n_episodes)
+        return self.estimate(policy, actor, batch, estimator, **options)
 
 
 @both
@@ -210,27 +213,20 @@ def test_earlier_rollouts_of_the_same_call_join_an_update(algorithm, monkeypatch
 
 
 @both
-def test_steps_are_shorter_where_returns_hardly_differ(algorithm):
-    model = make(algorithm, target_kl=0.02)
+def test_target_kl_is_scaled_unless_the_user_objects(algorithm):
     batch = frozen_episodes(small_policy("discrete")[0], lengths=(3, 1, 4, 2))
     differences = np.linspace(-1.0, 1.0, batch.n_steps)
 
-    def target(scale):
-        return model._scaled_target_kl(
-            dataclasses.replace(batch, returns=7.0 + scale * differences)
-        )
+    def targets(**arguments):
+        model = make(algorithm, target_kl=0.02, **arguments)
+        return [
+            model._update_target_kl(dataclasses.replace(batch, returns=scale * differences))
+            for scale in (100.0, 2.0, 1e-9)
+        ]
 
-    assert target(100.0) == 0.02
-    assert target(0.2 * 99.1) == pytest.approx(0.02)  # of a maximum that fades by 1 % an update
-    assert target(2.0) == pytest.approx(0.02 * (2.0 / (0.2 * 100.0 * 0.99**2)) ** 2)
-    assert target(1e-9) == pytest.approx(0.02 * 1e-4)
-    assert target(np.nan) == 0.02
-    assert target(1e9) == 0.02
-    assert target(100.0) == pytest.approx(0.02 * 1e-4)
-    for _ in range(2000):
-        last = target(100.0)
-    assert last == 0.02  # that outlier is forgotten
-    assert make(algorithm, target_kl=None)._scaled_target_kl(batch) is None
+    expected = [0.02, 0.02 * (2.0 / (0.2 * 100.0 * 0.99)) ** 2, 0.02 * 1e-4]
+    assert targets() == pytest.approx(expected)
+    assert targets(scale_target_kl=False) == [0.02] * 3
 
 
 @pytest.mark.parametrize("norm_reward", [False, True])
@@ -241,11 +237,22 @@ def test_returns_are_compared_in_the_units_of_the_environment(norm_reward):
 
     def target(variance):  # of the same returns
         env.ret_rms.var = np.array(variance)
-        return model._scaled_target_kl(batch)
+        return model._update_target_kl(batch)
 
     assert target(1.0) == 0.02
     shorter = 0.02 * (0.01 / (0.2 * 0.99)) ** 2
     assert target(1e-4) == pytest.approx(shorter if norm_reward else 0.02, rel=1e-3)
+
+
+def test_scaling_of_the_target_can_be_turned_off():
+    model = make(CRPN, target_kl=0.02)
+    batch = frozen_episodes(small_policy("discrete")[0], lengths=(3, 1, 4, 2))
+    model.kl_control.return_scale = 1e9
+    model.scale_target_kl = False
+    assert model._update_target_kl(batch) == 0.02
+    model.scale_target_kl = True
+    assert model._update_target_kl(batch) == pytest.approx(0.02 * 1e-4)
+    assert make(CRPN, target_kl=None)._update_target_kl(batch) is None
 
 
 @both
@@ -259,14 +266,26 @@ def test_the_target_of_each_update_is_logged_and_kept(algorithm):
 
 
 def replaced(algorithm, change):
-    """Return ``_solve`` with the step changed."""
-    solve = algorithm._solve
+    """Return ``_update_solver`` with the solver's steps changed."""
+    solver_of = algorithm._update_solver
 
-    def changed(self, model, alpha):
-        cubic = solve(self, model, alpha)
-        return dataclasses.replace(cubic, step=change(cubic.step))
+    def changed(self, batch):
+        return Changed(solver_of(self, batch), change)
 
     return changed
+
+
+@dataclasses.dataclass
+class Changed:
+    solver: SubproblemSolver
+    change: Callable[[torch.Tensor], torch.Tensor]
+
+    def needs_matrix(self, dim):
+        return self.solver.needs_matrix(dim)
+
+    def solve(self, model, alpha):
+        cubic = self.solver.solve(model, alpha)
+        return dataclasses.replace(cubic, step=self.change(cubic.step))
 
 
 @both
@@ -285,7 +304,7 @@ def replaced(algorithm, change):
 def test_bad_steps_are_rejected_bitwise(algorithm, metric, change, target_kl, monkeypatch):
     model, log = make(algorithm, metric=metric, target_kl=target_kl), TrainLog()
     earlier = tensors(model)
-    monkeypatch.setattr(algorithm, "_solve", replaced(algorithm, change))
+    monkeypatch.setattr(algorithm, "_update_solver", replaced(algorithm, change))
     monkeypatch.setattr(model, "_fit_critic", lambda batch, earlier: None)
     model.learn(20, log)
     assert log["step_rejected"] == [1] * len(log.rows)
@@ -309,7 +328,9 @@ def test_critic_leaves_what_it_shares_with_the_actor(algorithm, batch_norm, monk
             self.mlp_extractor.policy_net = self.mlp_extractor.value_net = shared
 
     model = make(algorithm, policy=Features, n_critic_updates=5)
-    monkeypatch.setattr(algorithm, "_solve", replaced(algorithm, lambda step: step * np.nan))
+    monkeypatch.setattr(
+        algorithm, "_update_solver", replaced(algorithm, lambda step: step * np.nan)
+    )
     observations = torch.randn(5, 2)
     values, logits = _outputs(model, observations)
     model.learn(60)

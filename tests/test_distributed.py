@@ -18,7 +18,15 @@ from sb3_crpn import ACRPN, CRPN
 from sb3_crpn.algorithm.critic import fit_critic
 from sb3_crpn.algorithm.evaluation import CandidateEvaluator
 from sb3_crpn.cubic import solve_dense
-from sb3_crpn.curvature import PairWeights, estimate_curvature, full_model, projected_model
+from sb3_crpn.curvature import (
+    Causal,
+    Euclidean,
+    Fisher,
+    FullModel,
+    JamesStein,
+    estimate_curvature,
+    subspace_model,
+)
 from sb3_crpn.distributed import (
     RankError,
     all_max,
@@ -31,8 +39,8 @@ from sb3_crpn.distributed import (
     rank,
     rank_seed,
     world_size,
-    zoo_options,
 )
+from sb3_crpn.zoo import zoo_options
 from tests.envs import Drift, Faulty
 from tests.policies import frozen_episodes, small_policy
 from tests.ranks import run_ranks
@@ -80,9 +88,9 @@ def measured(n_of_rank_0, max_steps=None):
     bounds = (0, n_of_rank_0, len(LENGTHS)) if world_size() > 1 else (0, len(LENGTHS))
     own = np.arange(bounds[rank()], bounds[rank() + 1])
     batch, few = union.take(own), union.take(own[own != 1])
-    weights = PairWeights("causal", 0.9)
-    estimate = estimate_curvature(policy, actor, batch, batch, weights, max_steps)
-    other = estimate_curvature(policy, actor, few, batch, weights, max_steps)
+    causal = Causal(0.9)
+    estimate = estimate_curvature(policy, actor, batch, causal, max_steps=max_steps)
+    other = estimate_curvature(policy, actor, few, causal, hessian_batch=batch, max_steps=max_steps)
     v = torch.linspace(-1.0, 1.0, len(actor), dtype=torch.float64)
     results = {
         "gradient": estimate.gradient,
@@ -95,8 +103,8 @@ def measured(n_of_rank_0, max_steps=None):
     }
     tester = CandidateEvaluator(policy, actor, batch, max_steps)
     for name, model in {
-        "fisher": projected_model(estimate, damping=0.1, dim=5, shrinkage=None),
-        "newton": projected_model(estimate, damping=None, dim=None, shrinkage=None),
+        "fisher": subspace_model(estimate, Fisher(0.1), JamesStein(), 5),
+        "newton": subspace_model(estimate, Euclidean(), JamesStein()),
     }.items():
         step = model.to_parameters(solve_dense(model.gradient, model.hessian, 10.0).step)
         trial = tester.evaluate(step)
@@ -104,7 +112,7 @@ def measured(n_of_rank_0, max_steps=None):
         results[f"{name} trial"] = torch.tensor([trial.kl, trial.surrogate_change])
         results[f"{name} shrinkage"] = torch.tensor(model.shrinkage)
     tester.restore()
-    results["product"] = full_model(other, 0.5).product(v)
+    results["product"] = FullModel(other, 0.5).product(v)
     # one minibatch a pass, for which nothing is drawn
     loss = fit_critic(
         policy, actor, batch, n_minibatches=3, batch_size=100, rng=np.random.default_rng(rank())
@@ -136,7 +144,7 @@ class Watch:
     """Keeps what a rank's running moments are updated with, and the policy after updates."""
 
     def __init__(self, monkeypatch, env):
-        update, give = RunningMeanStd.update, sb3_crpn.algorithm.update.broadcast_state
+        update, give = RunningMeanStd.update, sb3_crpn.algorithm.update.share_policy
         self.seen, self.states = defaultdict(list), []
 
         def recorded(moments, array):
@@ -151,7 +159,7 @@ class Watch:
             give(policy)
 
         monkeypatch.setattr(RunningMeanStd, "update", recorded)
-        monkeypatch.setattr(sb3_crpn.algorithm.update, "broadcast_state", compared)
+        monkeypatch.setattr(sb3_crpn.algorithm.update, "share_policy", compared)
 
 
 def trained(folder, algorithm, n_updates, **arguments):
@@ -173,7 +181,7 @@ def trained(folder, algorithm, n_updates, **arguments):
         "seen": {name: np.concatenate(arrays) for name, arrays in watch.seen.items()},
         "moments": {"obs": env.obs_rms, "ret": env.ret_rms},
         "timesteps": model.num_timesteps,
-        "alpha": model._fitted_alpha,
+        "alpha": model.kl_control.alpha,
         "length": model._mean_episode_length,
         "actions": model.rollout_buffer.actions[:4].flatten().tolist(),
         "outputs": len(model.logger.output_formats),

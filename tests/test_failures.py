@@ -1,6 +1,7 @@
 """Whatever happens, the policy stays usable, can be saved, and goes on."""
 
 import os
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -11,7 +12,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_crpn import ACRPN, PAPER
-from sb3_crpn.algorithm import collection
+from sb3_crpn.algorithm.evaluation import CandidateEvaluator
+from sb3_crpn.episodes import collector
 from tests.envs import Drift, Faulty, FaultyReset, Rewards, Sampler
 from tests.training import TrainLog, all_finite, both, make, same, several, tensors
 
@@ -148,15 +150,17 @@ def test_exception_in_a_callback(algorithm, where, error, tmp_path):
 def test_interrupt_while_steps_are_tried(algorithm, trial, monkeypatch, tmp_path):
     """The actor is moved to each trial step; an interrupt must not leave it there."""
     model = make(algorithm, target_kl=0.02).learn(20)
-    earlier, solve, calls = tensors(model), algorithm._solve, []
+    earlier, evaluate, calls = tensors(model), CandidateEvaluator.evaluate, []
 
-    def failing(self, *arguments):
-        calls.append(arguments)
+    def failing(self, step):
+        calls.append(step)
+        evaluation = evaluate(self, step)
         if len(calls) == trial:
             raise KeyboardInterrupt
-        return solve(self, *arguments)
+        # too long, so that another trial follows
+        return replace(evaluation, kl=1.0)
 
-    monkeypatch.setattr(algorithm, "_solve", failing)
+    monkeypatch.setattr(CandidateEvaluator, "evaluate", failing)
     with pytest.raises(KeyboardInterrupt):
         model.learn(20, reset_num_timesteps=False)
     monkeypatch.undo()
@@ -177,7 +181,7 @@ def test_killed_worker(tmp_path):
 
 @both
 def test_endless_episodes(algorithm, monkeypatch):
-    monkeypatch.setattr(collection, "ENDLESS", 40)
+    monkeypatch.setattr(collector, "ENDLESS", 40)
     endless = Drift(bound=INF, limit=INF)
     model = make(algorithm, endless)
     earlier = tensors(model)
@@ -194,7 +198,7 @@ def test_endless_episodes(algorithm, monkeypatch):
 
 @both
 def test_one_endless_environment_among_others(algorithm, monkeypatch):
-    monkeypatch.setattr(collection, "ENDLESS", 40)
+    monkeypatch.setattr(collector, "ENDLESS", 40)
     env = DummyVecEnv([Drift, lambda: Drift(bound=INF, limit=INF)])
     with pytest.raises(ValueError, match="horizon"):
         make(algorithm, env).learn(200)

@@ -12,7 +12,16 @@ from sb3_crpn import CRPN, distributed
 from sb3_crpn.algorithm.critic import fit_critic
 from sb3_crpn.algorithm.evaluation import CandidateEvaluator
 from sb3_crpn.cubic import solve_krylov
-from sb3_crpn.curvature import PairWeights, estimate_curvature, full_model, projected_model
+from sb3_crpn.curvature import (
+    Causal,
+    Constant,
+    Euclidean,
+    Fisher,
+    FullModel,
+    JamesStein,
+    estimate_curvature,
+    subspace_model,
+)
 from sb3_crpn.parameters import ActorParameters
 from tests.envs import Drift
 from tests.policies import ACTION_SPACES, frozen_episodes, log_probabilities, small_policy
@@ -36,9 +45,7 @@ def measured(kind, device):
     actor = ActorParameters.reachable(policy, log_probabilities(policy, batch))
     results = {}
     for max_steps in (None, 5):
-        estimate = estimate_curvature(
-            policy, actor, batch, batch, PairWeights("causal", 0.9), max_steps
-        )
+        estimate = estimate_curvature(policy, actor, batch, Causal(0.9), max_steps=max_steps)
         v = torch.linspace(-1.0, 1.0, len(actor), dtype=torch.float64)
         results |= {
             f"gradient {max_steps}": estimate.gradient,
@@ -47,9 +54,9 @@ def measured(kind, device):
             f"dense {max_steps}": estimate.hessian.to_dense(),
         }
         models = [
-            projected_model(estimate, damping=0.1, dim=5, shrinkage=None),
-            projected_model(estimate, damping=None, dim=None, shrinkage=0.5),
-            full_model(estimate, 1.0),
+            subspace_model(estimate, Fisher(0.1), JamesStein(), 5),
+            subspace_model(estimate, Euclidean(), Constant(0.5)),
+            FullModel(estimate, 1.0),
         ]
         steps = [
             model.to_parameters(solve_krylov(model.gradient, model.product, 10.0).step)

@@ -35,7 +35,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from benchmarks.experiments.study import PALETTE, Row, Study
 from sb3_crpn import CRPN
-from sb3_crpn.curvature import PairWeights
+from sb3_crpn.curvature import Causal
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.episodes.batch import episode_starts
@@ -122,7 +122,7 @@ class _Checkpoints(BaseCallback):
 
 def _halves(model: CRPN, batch: EpisodeBatch, kappa: float) -> list[Operator]:
     """Return the products with the Hessians of either half of the episodes."""
-    weights = PairWeights("causal", kappa)
+    weights = Causal(kappa)
     return [
         EpisodeDerivatives(model.policy, model.actor, part, weights).hessian_product
         for part in batch.split(2)

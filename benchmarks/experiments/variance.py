@@ -29,7 +29,7 @@ from benchmarks.exact import TabularMDP, expected_causal_hessian, random_mdp
 from benchmarks.experiments.learners import make_learner
 from benchmarks.experiments.study import PALETTE, Row, Study, interval
 from sb3_crpn import CRPN
-from sb3_crpn.curvature import PairWeights
+from sb3_crpn.curvature import Causal, HessianEstimator, Trajectory
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.episodes.batch import episode_time
@@ -72,7 +72,7 @@ def measure(horizon: int, seed: int) -> list[Row]:
     }
     rows = []
     for estimator, kappa, baseline in kinds:
-        weights = PairWeights(estimator, kappa)  # type: ignore[arg-type]
+        weights = Causal(kappa) if estimator == "causal" else Trajectory()
         hessians = [
             _hessian(model, _less_baseline(mdp, batch, baselines[baseline]), weights)
             for batch in batches
@@ -111,7 +111,7 @@ def _states(batch: EpisodeBatch) -> NDArray[np.int64]:
     return batch.observations.argmax(1).numpy()
 
 
-def _hessian(model: CRPN, batch: EpisodeBatch, weights: PairWeights) -> torch.Tensor:
+def _hessian(model: CRPN, batch: EpisodeBatch, weights: HessianEstimator) -> torch.Tensor:
     """Return the estimate of ∇²J from one batch, [d, d]."""
     group = EpisodeDerivatives(model.policy, model.actor, batch, weights)
     identity = torch.eye(len(model.actor), dtype=torch.float64)

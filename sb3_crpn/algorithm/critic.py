@@ -12,10 +12,11 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 from torch.nn import functional
 
-from sb3_crpn.distributed import all_max, all_sum, gather_counts, mean_and_variance, world_size
-from sb3_crpn.episodes import EpisodeBatch, Observations
-from sb3_crpn.episodes.batch import FloatArray, map_observations
+from sb3_crpn.arrays import Observations
+from sb3_crpn.episodes import EpisodeBatch
+from sb3_crpn.episodes.batch import map_observations
 from sb3_crpn.parameters import ActorParameters
+from sb3_crpn.policy import state_values
 
 
 def fit_critic(
@@ -39,7 +40,7 @@ def fit_critic(
     actor
         Parameters that stay as they are, also where the critic shares them.
     batch
-        This rank's episodes, possibly none. Gradients, losses and units are those of all ranks'.
+        The episodes. With several ranks gradients, losses and units are those of all of them.
     n_minibatches, batch_size
         How many minibatches of this size, in random passes over the steps of all ranks' batches;
         each rank contributes to them in proportion to its steps.
@@ -53,7 +54,7 @@ def fit_critic(
         loss that are not finite end the fit with the parameters as they are: infinity.
     """
     largest = float(np.abs(batch.returns).max(initial=0.0))
-    largest = all_max(largest if np.isfinite(largest) else float("inf"))
+    largest = batch.largest(largest if np.isfinite(largest) else float("inf"))
     if np.isinf(largest):
         return float("inf")
     if not n_minibatches:
@@ -61,17 +62,17 @@ def fit_critic(
     # not in training mode: a normalisation layer's statistics may be the actor's too
     policy.set_training_mode(False)
     layer = _output_layer(policy, actor)
-    shift, scale = (0.0, 1.0) if layer is None else _units(batch.returns, largest)
+    shift, scale = (0.0, 1.0) if layer is None else _units(batch, largest)
     dtype = next(policy.parameters()).dtype
     returns = torch.as_tensor((batch.returns - shift) / scale, dtype=dtype, device=policy.device)
     losses = []
     with _in_units(layer, shift, scale):
-        for chosen in _minibatches(batch.n_steps, n_minibatches, batch_size, rng, policy.device):
+        for chosen in _minibatches(batch, n_minibatches, batch_size, rng, policy.device):
             policy.optimizer.zero_grad()
             loss = _backward(policy, _at(batch.observations, chosen), returns[chosen])
             for parameter in actor.tensors:
                 parameter.grad = None  # the optimiser passes over it
-            losses.append(_average(policy, actor, loss, len(chosen)))
+            losses.append(_average(policy, actor, batch, loss, len(chosen)))
             if not np.isfinite(losses[-1]):
                 return float("inf")
             policy.optimizer.step()
@@ -93,16 +94,20 @@ def fuse(optimizer: torch.optim.Optimizer) -> None:
 
 
 def _minibatches(
-    n_steps: int, number: int, batch_size: int, rng: np.random.Generator, device: torch.device
+    batch: EpisodeBatch,
+    number: int,
+    batch_size: int,
+    rng: np.random.Generator,
+    device: torch.device,
 ) -> Iterator[torch.Tensor]:
     """Yield this rank's steps of each minibatch: equally many minibatches on every rank."""
-    total = sum(gather_counts(n_steps))
+    total = batch.total_steps
     per_pass = math.ceil(total / batch_size)
-    size = max(1, math.ceil(batch_size * n_steps / total))
+    size = max(1, math.ceil(batch_size * batch.n_steps / total))
     for index in range(number):
         start = index % per_pass * size
         if start == 0:
-            order = torch.as_tensor(rng.permutation(n_steps), device=device)
+            order = torch.as_tensor(rng.permutation(batch.n_steps), device=device)
         yield order[start : start + size]
 
 
@@ -112,20 +117,26 @@ def _backward(
     """Leave the gradient of the mean squared error in the parameters, and return the error."""
     if not len(returns):
         return 0.0
-    loss = functional.mse_loss(policy.predict_values(observations).flatten(), returns)
+    loss = functional.mse_loss(state_values(policy, observations), returns)
     torch.autograd.backward(loss)
     return loss.item()
 
 
-def _average(policy: ActorCriticPolicy, actor: ActorParameters, loss: float, n_steps: int) -> float:
+def _average(
+    policy: ActorCriticPolicy,
+    actor: ActorParameters,
+    batch: EpisodeBatch,
+    loss: float,
+    n_steps: int,
+) -> float:
     """Replace gradients and loss by their means over all ranks' steps, in one message."""
-    if world_size() == 1:
+    if batch.is_whole:
         return loss
     fixed = {id(tensor) for tensor in actor.tensors}
     own = [p for p in policy.parameters() if p.requires_grad and id(p) not in fixed]
     gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in own]
     flat = torch.cat([gradient.reshape(-1) for gradient in gradients])
-    total = all_sum(n_steps * torch.cat([flat, flat.new_tensor([loss, 1.0])]))
+    total = batch.total(n_steps * torch.cat([flat, flat.new_tensor([loss, 1.0])]))
     *means, last = torch.split(total / total[-1], [*(p.numel() for p in own), 2])
     for parameter, gradient in zip(own, means, strict=True):
         parameter.grad = gradient.view_as(parameter).to(parameter.dtype)
@@ -136,9 +147,9 @@ def _at(observations: Observations, steps: torch.Tensor) -> Observations:
     return map_observations(observations, lambda tensor: tensor[steps])
 
 
-def _units(returns: FloatArray, largest: float) -> tuple[float, float]:
+def _units(batch: EpisodeBatch, largest: float) -> tuple[float, float]:
     """Return the mean and the standard deviation of the returns, the latter never negligible."""
-    shift, variance = mean_and_variance(returns)
+    shift, variance = batch.moments(batch.returns)
     return shift, max(math.sqrt(variance), 0.01 * largest) or 1.0
 
 

@@ -1,26 +1,18 @@
-"""Trying a step on the batch that it was computed from, and fitting its length to a KL target."""
+"""Trying a step on the batch that it was computed from."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_crpn.curvature.derivatives import mean_divergence, policy_distribution
-from sb3_crpn.distributed import all_sum, broadcast
+from sb3_crpn.curvature.derivatives import policy_distribution
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.parameters import ActorParameters
-
-# target_kl counts as met within 10 per cent (DESIGN section 5)
-KL_TOLERANCE = 0.1
-# Bisection on log α: 40 trials narrow 30 decades to the tolerance
-MAX_TRIALS = 40
-# Below it the cubic term is lost in the rounding of the others; far below it, α is 0
-LOG_MIN_ALPHA = math.log(1e-30)
+from sb3_crpn.policy import mean_divergence
 
 
 @dataclass(frozen=True)
@@ -45,16 +37,21 @@ class StepEvaluation:
 
 
 class CandidateEvaluator:
-    """Moves the actor to θ + s and back, one forward pass a trial.
+    """Moves the actor to θ + s and back, one forward pass an evaluation.
 
     Parameters
     ----------
     policy, actor
         The policy at θ, in evaluation mode, and its actor's parameters.
     batch
-        This rank's episodes on which steps are tried.
+        The episodes on which steps are tried.
     max_steps
         Most steps in one forward pass, but at least one episode; ``None``: all.
+
+    Attributes
+    ----------
+    n_trials
+        Steps evaluated so far.
     """
 
     def __init__(
@@ -64,8 +61,9 @@ class CandidateEvaluator:
         batch: EpisodeBatch,
         max_steps: int | None = None,
     ) -> None:
+        self.batch, self.n_trials = batch, 0
         self._policy, self._actor = policy, actor
-        self._sizes = torch.tensor([batch.n_steps, batch.n_episodes], dtype=torch.float64)
+        self._sizes = torch.tensor([batch.n_steps, batch.size], dtype=torch.float64)
         self._origin = actor.snapshot()
         self._vector = actor.vector
         self._pieces: list[tuple[EpisodeBatch, Distribution, torch.Tensor, torch.Tensor]] = []
@@ -77,14 +75,19 @@ class CandidateEvaluator:
             self._pieces.append((piece, reference, log_prob, weights))
 
     def evaluate(self, step: torch.Tensor) -> StepEvaluation:
-        """Leave the actor at θ + ``step``, [d], of rank 0, and say what that does."""
-        step = broadcast(step)
+        """Leave the actor at θ + ``step``, [d], the same on every rank, and say what that does."""
+        self.n_trials += 1
         if not torch.isfinite(step).all():
             return StepEvaluation(math.inf, math.inf)
-        self._actor.load(self._actor.unflatten(self._vector + step))
+        self.move(step)
         sums = torch.tensor(self._sums(), dtype=torch.float64)
-        divergence, change, n_steps, n_episodes = all_sum(torch.cat([sums, self._sizes])).tolist()
-        return StepEvaluation(divergence / n_steps, change / n_episodes)
+        total = self.batch.total(torch.cat([sums, self._sizes]))
+        divergence, change, n_steps, size = total.tolist()
+        return StepEvaluation(divergence / n_steps, change / size)
+
+    def move(self, step: torch.Tensor) -> None:
+        """Move the actor to θ + ``step``, [d]."""
+        self._actor.load(self._actor.unflatten(self._vector + step))
 
     def _sums(self) -> tuple[float, float]:
         """Return Σ_i KL_i and Σ_i A_i (π_θ+s/π_θ - 1) over this rank's steps."""
@@ -104,51 +107,3 @@ class CandidateEvaluator:
     def restore(self) -> None:
         """Put the actor back to θ, bit for bit."""
         self._actor.load(self._origin)
-
-
-def fit_alpha(kl: Callable[[float], float], alpha: float, target: float) -> float:
-    """Return the smallest α whose step keeps the mean KL ≤ ``target``, met within 10 per cent.
-
-    The KL falls with α, as 1/α where the cubic term dominates: the first guesses extrapolate that
-    law on log α, bisection takes over once the target is bracketed. Where a smaller α no longer
-    raises the KL (the Newton step lies inside the trust region), or the target is jumped over, the
-    best α found is returned.
-
-    Parameters
-    ----------
-    kl
-        α ↦ mean KL of its step; not a number or infinite counts as too large.
-    alpha
-        Where to start, > 0.
-    target
-        > 0.
-    """
-    low, high = -math.inf, math.inf  # log α with too large a KL, and with an allowed one
-    log_alpha, previous_kl = math.log(alpha), math.nan
-    for _ in range(MAX_TRIALS):
-        divergence = kl(math.exp(log_alpha))
-        if math.isfinite(divergence) and divergence <= target:
-            if divergence >= (1.0 - KL_TOLERANCE) * target:
-                return math.exp(log_alpha)
-            if log_alpha < high and divergence <= previous_kl * 1.01 and low == -math.inf:
-                return math.exp(high)
-            high, previous_kl = log_alpha, divergence
-        else:
-            low = log_alpha
-        if math.isinf(low) or math.isinf(high):
-            log_alpha = max(LOG_MIN_ALPHA, log_alpha + _extrapolate(divergence, target))
-        else:
-            log_alpha = 0.5 * (low + high)
-        if high - low < 1e-6:
-            break
-    return math.exp(high) if math.isfinite(high) else math.exp(log_alpha)
-
-
-def _extrapolate(divergence: float, target: float) -> float:
-    """Return the change of log α that brings KL ∝ 1/α to the middle of the tolerance."""
-    if not math.isfinite(divergence):
-        return math.log(100.0)
-    middle = (1.0 - 0.5 * KL_TOLERANCE) * target
-    change = math.log(max(divergence, 1e-12 * target) / middle)
-    # twice the law's step where it is small, so that a flatter law is bracketed soon
-    return math.copysign(max(2.0 * abs(change) if abs(change) < 1.0 else abs(change), 0.1), change)

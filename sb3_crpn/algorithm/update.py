@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,22 +12,28 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_crpn.algorithm.arguments import check_integer, check_real
-from sb3_crpn.algorithm.collection import EpisodeCollection
 from sb3_crpn.algorithm.critic import fit_critic
+from sb3_crpn.algorithm.distributed_training import share_policy
 from sb3_crpn.algorithm.evaluation import CandidateEvaluator
+from sb3_crpn.algorithm.kl_control import KLControl
+from sb3_crpn.algorithm.rollouts import RolloutAlgorithm
+from sb3_crpn.algorithm.settings import CheckedSchedule
+from sb3_crpn.algorithm.solvers import SubproblemSolver
+from sb3_crpn.algorithm.statistics import UpdateStats
 from sb3_crpn.algorithm.step import PolicyStep, take_step
-from sb3_crpn.cubic import CubicStep
+from sb3_crpn.checks import COUNT, NONE, real, requires
 from sb3_crpn.curvature import (
+    HESSIAN_ESTIMATORS,
+    METRICS,
+    Constant,
     CurvatureEstimate,
+    Euclidean,
+    FullModel,
     LocalModel,
-    PairWeights,
     estimate_curvature,
-    full_model,
-    projected_model,
+    resolve_shrinkage,
+    subspace_model,
 )
-from sb3_crpn.curvature.derivatives import HessianEstimator
-from sb3_crpn.distributed import broadcast_state, gather_counts, local_count, mean_and_variance
 from sb3_crpn.episodes import (
     EpisodeBatch,
     EpisodeRolloutBuffer,
@@ -34,60 +41,68 @@ from sb3_crpn.episodes import (
     concatenate,
 )
 from sb3_crpn.parameters import ActorParameters
+from sb3_crpn.policy import unchanged_on_error
 
 # Dimension of the Krylov space when the step's length is set by the KL divergence: the number of
 # conjugate-gradient iterations of Schulman et al., Trust region policy optimization, ICML 2015,
 # appendix C, whose step H = 0 then reproduces.
 KRYLOV_DIM = 10
 
-# Steps are shortened where the returns' standard deviation is below this fraction of its recent
-# maximum, which fades by the factor SCALE_DECAY an update
-FULL_KL_FRACTION = 0.2
-SCALE_DECAY = 0.99
-# The shortest, a hundredth: its KL divergence can still be told from 0 in single precision
-MIN_KL_SCALE = 1e-2
+_VEC_ENV = requires("a VecEnv", lambda value: isinstance(value, VecEnv))
 
 
-class PolicyNewtonUpdate(EpisodeCollection):
+class PolicyNewtonUpdate(RolloutAlgorithm):
     """The update of DESIGN section 5; the subclass brings the arguments and the solver."""
 
-    actor: ActorParameters
     replay: Replay
-    n_episodes: int | Schedule | None
-    n_hessian_episodes: int | Schedule | None
-    alpha_schedule: Schedule
-    target_kl: float | None
-    metric: Literal["euclidean", "fisher"]
-    fisher_damping: float
-    hessian_estimator: HessianEstimator
-    hessian_lambda: float
-    hessian_shrinkage: float | Literal["auto"] | None
-    krylov_dim: int | None
-    max_batch_timesteps: int | None
-    normalize_advantage: bool
-    discount_visitation: bool
-    batch_size: int
-    n_critic_updates: int
+    alpha_schedule: CheckedSchedule
+    kl_control: KLControl
+    last_update: UpdateStats | None = None  # of this call of learn
     _rng: np.random.Generator
-    _fitted_alpha: float | None = None  # the last α that met target_kl
-    _return_scale = 0.0  # the largest standard deviation of the returns, fading
+
+    @property
+    def actor(self) -> ActorParameters:
+        """The parameters θ that log π depends on."""
+        raise NotImplementedError
 
     def train(self) -> None:
-        """Update the policy from the episodes just collected (DESIGN section 5)."""
+        """Update the policy from the rollout just collected (DESIGN section 5), or not at all."""
+        with unchanged_on_error(self.policy):
+            self._update()
+
+    def _update(self) -> None:
         self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
         batch = self._episode_batch(self.rollout_buffer)
+        if not self.tracker.whole_episodes:
+            batch = replace(batch, unit="n_steps")
         earlier = self.replay.reweighted(self.policy, **self._weighting)
-        estimate = self._estimate(batch, earlier)
-        model = self._local_model(estimate)
-        target_kl = self._scaled_target_kl(batch)
-        step = self._take_step(estimate.gradient_batch, model, target_kl)
-        value_loss = self._fit_critic(batch, earlier)
-        if step.trial.finite:  # what spoilt one step would spoil the next ones
+        joined = concatenate([batch, *earlier])
+        estimate = self._estimate(batch, joined, earlier)
+        solver = self._update_solver(batch)
+        model = self._local_model(estimate, solver)
+        target_kl = self._update_target_kl(batch)
+        evaluator = CandidateEvaluator(
+            self.policy, self.actor, estimate.gradient_batch, self.max_batch_timesteps
+        )
+        alpha = self._first_alpha(target_kl)
+        step, accepted = take_step(evaluator, model, solver, alpha, target_kl)
+        value_loss = self._fit_critic(batch, joined)
+        if step.evaluation.finite:  # what spoilt one step would spoil the next ones
             self.replay.append(batch)
-        broadcast_state(self.policy)
+            if target_kl is not None:
+                self.kl_control.alpha = step.alpha
+        share_policy(self.policy)
         self._n_updates += 1
-        self._log_update(batch, len(earlier), estimate, model, step, target_kl, value_loss)
+        self.last_update = UpdateStats(
+            **_step_statistics(estimate, model, step, accepted),
+            **self._batch_statistics(batch),
+            n_reused_rollouts=len(earlier),
+            n_trials=evaluator.n_trials,
+            target_kl=target_kl,
+            value_loss=value_loss,
+        )
+        self.last_update.write(self.logger)
 
     def estimate_curvature(self, n_episodes: int, env: VecEnv | None = None) -> CurvatureEstimate:
         """Estimate gradient and Hessian of J at the current policy from fresh episodes.
@@ -102,10 +117,17 @@ class PolicyNewtonUpdate(EpisodeCollection):
         env
             Where to simulate; ``None``: the training environment.
         """
-        check_integer("n_episodes", n_episodes, 1)
-        broadcast_state(self.policy)
-        batch = self._episode_batch(self._collect_fresh(n_episodes, env))
-        return self._estimate_from(batch, batch)
+        n_episodes = COUNT("estimate_curvature: n_episodes", n_episodes)
+        env = (_VEC_ENV | NONE)("estimate_curvature: env", env)
+        share_policy(self.policy)
+        batch = self._episode_batch(self._collect_evaluation_episodes(n_episodes, env))
+        return estimate_curvature(
+            self.policy,
+            self.actor,
+            batch,
+            HESSIAN_ESTIMATORS.resolve(self.hessian_estimator, self),
+            max_steps=self.max_batch_timesteps,
+        )
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         """Keep the progress of schedules in [0, 1]: whole episodes overrun the last timestep."""
@@ -114,14 +136,17 @@ class PolicyNewtonUpdate(EpisodeCollection):
 
     def _scheduled_episodes(self) -> tuple[int | None, int | None]:
         progress = self._current_progress_remaining
-        numbers: list[int | None] = []
-        for name in ("n_episodes", "n_hessian_episodes"):
-            value = getattr(self, name)
-            if callable(value):
-                value = value(progress)
-                check_real(f"{name}({progress:g})", value, 1.0)
-            numbers.append(None if value is None else round(value))
-        return numbers[0], numbers[1]
+
+        def number(name: str, value: int | Schedule | None) -> int | None:
+            if value is None:
+                return None
+            name = f"{type(self).__name__}: {name}"
+            return round(CheckedSchedule(name, value, real(1.0))(progress))
+
+        return (
+            number("n_episodes", self.n_episodes),
+            number("n_hessian_episodes", self.n_hessian_episodes),
+        )
 
     def _episode_batch(self, buffer: RolloutBuffer) -> EpisodeBatch:
         assert isinstance(buffer, EpisodeRolloutBuffer)  # by _setup_model
@@ -135,85 +160,59 @@ class PolicyNewtonUpdate(EpisodeCollection):
             "discount_visitation": self.discount_visitation,
         }
 
-    def _estimate(self, batch: EpisodeBatch, earlier: list[EpisodeBatch]) -> CurvatureEstimate:
+    def _estimate(
+        self, batch: EpisodeBatch, joined: EpisodeBatch, earlier: list[EpisodeBatch]
+    ) -> CurvatureEstimate:
         """Estimate g from m_k and H from b_k of the episodes, and from the earlier ones.
 
         F, of which no return makes noise, is the m_k episodes' alone.
         """
         m, b = self._batch_sizes  # of the progress at which they were simulated
-        n_simulated = sum(gather_counts(batch.n_episodes))
-        drawn = self._draw(batch, m, n_simulated)
-        gradient_batch = concatenate([drawn, *earlier])
-        hessian_batch = gradient_batch
-        if b is not None:
-            hessian_batch = concatenate([self._draw(batch, b, n_simulated), *earlier])
-        return self._estimate_from(gradient_batch, hessian_batch, drawn)
-
-    def _estimate_from(
-        self,
-        gradient_batch: EpisodeBatch,
-        hessian_batch: EpisodeBatch,
-        fisher_batch: EpisodeBatch | None = None,
-    ) -> CurvatureEstimate:
+        n_simulated = batch.total_episodes
+        drawn = batch if m is None or m >= n_simulated else self._draw(batch, m)
+        hessian_batch = None
+        if b is not None and b < n_simulated:
+            hessian_batch = concatenate([self._draw(batch, b), *earlier])
+        elif b is not None and drawn is not batch:
+            hessian_batch = joined
         return estimate_curvature(
             self.policy,
             self.actor,
-            gradient_batch,
-            hessian_batch,
-            PairWeights(self.hessian_estimator, self.hessian_lambda),
-            self.max_batch_timesteps,
-            fisher_batch,
+            joined if drawn is batch else concatenate([drawn, *earlier]),
+            HESSIAN_ESTIMATORS.resolve(self.hessian_estimator, self),
+            hessian_batch=hessian_batch,
+            fisher_batch=drawn if earlier else None,
+            max_steps=self.max_batch_timesteps,
         )
 
-    def _draw(self, batch: EpisodeBatch, n_episodes: int | None, n_simulated: int) -> EpisodeBatch:
-        """Draw this rank's share of episodes without replacement; all are the batch itself."""
-        if n_episodes is None or n_episodes >= n_simulated:
-            return batch
+    def _draw(self, batch: EpisodeBatch, n_episodes: int) -> EpisodeBatch:
+        """Draw this rank's share of ``n_episodes`` without replacement."""
         return batch.take(
-            self._rng.choice(batch.n_episodes, local_count(n_episodes), replace=False)
+            self._rng.choice(batch.n_episodes, batch.share(n_episodes), replace=False)
         )
 
-    def _prefers_dense(self) -> bool:
-        """Whether the model is to be written out on all of ℝᵈ."""
-        return False
-
-    def _local_model(self, estimate: CurvatureEstimate) -> LocalModel:
-        """Build the cubic model, on a subspace unless the paper's full space is asked for."""
-        fisher = self.metric == "fisher"
-        shrinkage = 1.0 if self.hessian_shrinkage is None else self.hessian_shrinkage
-        unrestricted = self.krylov_dim is None and self.target_kl is None and not fisher
-        if not self._prefers_dense() and unrestricted and shrinkage != "auto":
-            return full_model(estimate, shrinkage)
-        dim = KRYLOV_DIM if self.krylov_dim is None else self.krylov_dim
-        return projected_model(
-            estimate,
-            damping=self.fisher_damping if fisher else None,
-            dim=None if self._prefers_dense() else dim,
-            shrinkage=None if shrinkage == "auto" else shrinkage,
-        )
-
-    def _solve(self, model: LocalModel, alpha: float) -> CubicStep:
-        """Minimise the cubic model: what CRPN and ACRPN differ in."""
+    def _update_solver(self, batch: EpisodeBatch) -> SubproblemSolver:
+        """Return the solver of this update: what CRPN and ACRPN differ in."""
         raise NotImplementedError
 
-    def _scaled_target_kl(self, batch: EpisodeBatch) -> float | None:
-        """Return δ_k = δ min(1, 5σ_k/σ̄_k)², σ̄_k = max(σ_k, 0.99 σ̄_{k-1}), δ = ``target_kl``.
+    def _local_model(self, estimate: CurvatureEstimate, solver: SubproblemSolver) -> LocalModel:
+        """Build the cubic model, on a subspace unless the paper's full space is asked for."""
+        metric = METRICS.resolve(self.metric, self)
+        shrinkage = resolve_shrinkage(self.hessian_shrinkage, self)
+        if solver.needs_matrix(len(self.actor)):
+            return subspace_model(estimate, metric, shrinkage)
+        unrestricted = self.krylov_dim is None and self.target_kl is None
+        if unrestricted and isinstance(metric, Euclidean) and isinstance(shrinkage, Constant):
+            return FullModel(estimate, shrinkage.value)
+        dim = KRYLOV_DIM if self.krylov_dim is None else self.krylov_dim
+        return subspace_model(estimate, metric, shrinkage, dim)
 
-        σ_k is the standard deviation of the λ-returns, in the units that the rewards had before
-        ``VecNormalize``. Once a task is solved all episodes are alike and σ_k falls by orders of
-        magnitude: what is left to the advantages is the critic's error, which a step that is
-        fitted to a target follows as far as it followed the returns. This one's length is in
-        proportion to σ_k.
-        """
-        if self.target_kl is None:
-            return None
-        deviation = self._reward_unit() * math.sqrt(mean_and_variance(batch.returns)[1])
-        if not math.isfinite(deviation):  # nor is the step, which is rejected
+    def _update_target_kl(self, batch: EpisodeBatch) -> float | None:
+        """Return ``target_kl``, scaled by the spread of the returns unless the user objects."""
+        if self.target_kl is None or not self.scale_target_kl:
             return self.target_kl
-        self._return_scale = max(deviation, SCALE_DECAY * self._return_scale)
-        full = FULL_KL_FRACTION * self._return_scale
-        signal = deviation / full if full else 1.0
-        return self.target_kl * min(1.0, max(MIN_KL_SCALE, signal)) ** 2
+        deviation = self._reward_unit() * math.sqrt(batch.moments(batch.returns)[1])
+        return self.kl_control.scaled_target(self.target_kl, deviation)
 
     def _reward_unit(self) -> float:
         """Return what ``VecNormalize`` divides rewards by, √(Var[Σγ^h r_h] + ε); else 1."""
@@ -222,77 +221,68 @@ class PolicyNewtonUpdate(EpisodeCollection):
             return 1.0
         return math.sqrt(float(normalizer.ret_rms.var) + normalizer.epsilon)
 
-    def _take_step(
-        self, batch: EpisodeBatch, model: LocalModel, target_kl: float | None
-    ) -> PolicyStep:
-        """Choose α, move the actor, and move it back if the step is no good."""
+    def _first_alpha(self, target_kl: float | None) -> float:
         alpha = self.alpha_schedule(self._current_progress_remaining)
-        if target_kl is not None and self._fitted_alpha is not None:
-            alpha = self._fitted_alpha
-        step = take_step(
-            CandidateEvaluator(self.policy, self.actor, batch, self.max_batch_timesteps),
-            model,
-            lambda alpha: self._solve(model, alpha),
-            alpha,
-            target_kl,
-        )
-        if target_kl is not None and step.trial.finite:
-            self._fitted_alpha = step.alpha
-        return step
+        return alpha if target_kl is None else self.kl_control.first_alpha(alpha)
 
-    def _fit_critic(self, batch: EpisodeBatch, earlier: list[EpisodeBatch]) -> float | None:
+    def _fit_critic(self, batch: EpisodeBatch, joined: EpisodeBatch) -> float | None:
         """Regress V on the λ-returns; ``None`` where V is not used.
 
         The earlier rollouts share in the minibatches of the fresh one, which become no more.
         """
         if not self.uses_critic:
             return None
-        per_pass = math.ceil(sum(gather_counts(batch.n_steps)) / self.batch_size)
+        per_pass = math.ceil(batch.total_steps / self.batch_size)
         return fit_critic(
             self.policy,
             self.actor,
-            concatenate([batch, *earlier]),
+            joined,
             n_minibatches=self.n_critic_updates * per_pass,
             batch_size=self.batch_size,
             rng=self._rng,
         )
 
-    def _log_update(
-        self,
-        batch: EpisodeBatch,
-        n_earlier: int,
-        estimate: CurvatureEstimate,
-        model: LocalModel,
-        step: PolicyStep,
-        target_kl: float | None,
-        value_loss: float | None,
-    ) -> None:
-        assert isinstance(self.rollout_buffer, EpisodeRolloutBuffer)  # by _setup_model
-        values = {
-            "gradient_norm": float(estimate.gradient.norm()),
-            "gradient_noise": estimate.gradient_noise,
-            **step.log(),
-            "lambda_min": step.cubic.lambda_min if model.basis is None else model.lambda_min,
-            "hessian_vector_products": model.products or step.cubic.products,
-            "hessian_shrinkage": model.shrinkage,
-            "n_episodes": sum(gather_counts(batch.n_episodes)),
-            "n_reused_rollouts": n_earlier,
-            "used_timesteps_fraction": self.rollout_buffer.used_fraction,
+    def _batch_statistics(self, batch: EpisodeBatch) -> dict[str, Any]:
+        log_std = getattr(self.policy, "log_std", None)
+        return {
+            "n_updates": self._n_updates,
+            "n_episodes": batch.total_episodes,
+            "used_timesteps_fraction": self._used_fraction,
             "explained_variance": _explained_variance(batch),
+            "std": None if log_std is None else torch.exp(log_std).mean().item(),
         }
-        if target_kl is not None:
-            values["target_kl"] = target_kl
-        if value_loss is not None:
-            values["value_loss"] = value_loss
-        if hasattr(self.policy, "log_std"):
-            values["std"] = torch.exp(self.policy.log_std).mean().item()
-        for key, value in values.items():
-            self.logger.record(f"train/{key}", value)
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+
+def _step_statistics(
+    estimate: CurvatureEstimate, model: LocalModel, step: PolicyStep, accepted: bool
+) -> dict[str, Any]:
+    """Return what is known of the step; one that was not accepted has had no effect."""
+    cubic, batch = step.cubic, estimate.gradient_batch
+    change = step.evaluation.surrogate_change if accepted else 0.0
+    mean_cost = batch.moments(batch.cost_advantages)[0]
+    return {
+        "gradient_norm": float(estimate.gradient.norm()),
+        "gradient_noise": estimate.gradient_noise,
+        "alpha": step.alpha,
+        "multiplier": cubic.multiplier,
+        "predicted_decrease": cubic.predicted_decrease,
+        "step_norm": float(step.step.norm()) if accepted else 0.0,
+        "kl_divergence": step.kl if accepted else 0.0,
+        "surrogate_change": change,
+        "policy_objective": -mean_cost - change * batch.total_episodes / batch.total_steps,
+        "accepted": accepted,
+        "certified": cubic.certified,
+        "solver_status": cubic.status,
+        # the ranks' solves agree to rounding: the end of training is rank 0's decision
+        "at_sosp": bool(batch.agreed(torch.tensor(cubic.at_sosp))),
+        "lambda_min": model.lambda_min(cubic),
+        "hessian_vector_products": model.products(cubic),
+        "hessian_shrinkage": model.shrinkage,
+    }
 
 
 def _explained_variance(batch: EpisodeBatch) -> float:
     """Return 1 - Var[R - V] / Var[R] over the steps of all ranks; nan where Var[R] = 0."""
-    variance = mean_and_variance(batch.returns)[1]
-    unexplained = mean_and_variance(batch.returns - batch.values)[1]
+    variance = batch.moments(batch.returns)[1]
+    unexplained = batch.moments(batch.returns - batch.values)[1]
     return 1.0 - unexplained / variance if variance else float("nan")

@@ -14,17 +14,9 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
-from sb3_crpn.cubic.step import (
-    EPS,
-    ArrayLike,
-    CountedOperator,
-    CubicStep,
-    Operator,
-    as_vector,
-    at_least,
-    positive,
-    random_unit_vector,
-)
+from sb3_crpn.arrays import ArrayLike, Operator, as_vector
+from sb3_crpn.checks import COUNT, NONE, POSITIVE, SEED, real
+from sb3_crpn.cubic.step import EPS, CountedOperator, CubicStep, random_unit_vector
 
 # Step size 1/(20ℓ) (Tripuraneni et al. 2018, Algorithms 3 and 4)
 _STEP_DIVISOR = 20
@@ -95,10 +87,17 @@ def cubic_subsolver(
     ValueError
         For a wrong shape, a non-finite number (products included), α, ε ≤ 0, ℓ < 0, N̂ < 1.
     """
-    g = as_vector("gradient", gradient)
-    rho, epsilon = positive("alpha", alpha), positive("epsilon", epsilon)
-    operator = CountedOperator("hvp", hvp)
-    lipschitz = _lipschitz(operator, g, gradient_lipschitz)
+    g = as_vector("cubic_subsolver: gradient", gradient)
+    rho, epsilon = (
+        POSITIVE("cubic_subsolver: alpha", alpha),
+        POSITIVE("cubic_subsolver: epsilon", epsilon),
+    )
+    operator = CountedOperator("cubic_subsolver: hvp", hvp)
+    max_steps = (COUNT | NONE)("cubic_subsolver: max_steps", max_steps)
+    given = (real(0.0) | NONE)("cubic_subsolver: gradient_lipschitz", gradient_lipschitz)
+    seed = SEED("cubic_subsolver: seed", seed)
+    # Correction: the paper supposes ℓ known; here it is estimated if not given
+    lipschitz = estimate_lipschitz(operator, g) if given is None else given
     steps = _descent_steps(max_steps, lipschitz, rho, epsilon, g.numel())
 
     norm = float(torch.linalg.vector_norm(g))
@@ -131,10 +130,16 @@ def cubic_finalsolver(
     Parameters, result and errors are those of `cubic_subsolver`; no randomness but in the
     estimate of ℓ.
     """
-    g = as_vector("gradient", gradient)
-    rho, epsilon = positive("alpha", alpha), positive("epsilon", epsilon)
-    operator = CountedOperator("hvp", hvp)
-    lipschitz = _lipschitz(operator, g, gradient_lipschitz)
+    g = as_vector("cubic_finalsolver: gradient", gradient)
+    rho, epsilon = (
+        POSITIVE("cubic_finalsolver: alpha", alpha),
+        POSITIVE("cubic_finalsolver: epsilon", epsilon),
+    )
+    operator = CountedOperator("cubic_finalsolver: hvp", hvp)
+    max_steps = (COUNT | NONE)("cubic_finalsolver: max_steps", max_steps)
+    given = (real(0.0) | NONE)("cubic_finalsolver: gradient_lipschitz", gradient_lipschitz)
+    # Correction: the paper supposes ℓ known; here it is estimated if not given
+    lipschitz = estimate_lipschitz(operator, g) if given is None else given
     curvature = max(lipschitz, math.sqrt(rho * float(torch.linalg.vector_norm(g))))
     steps = _descent_steps(max_steps, curvature, rho, epsilon, g.numel())
     descent = _descend(g, operator, rho, curvature, epsilon / 2, steps)
@@ -161,11 +166,13 @@ def estimate_lipschitz(
     seed
         Of the random start; the global generator is not touched.
     """
-    operator = CountedOperator("hvp", hvp)
+    products = COUNT("estimate_lipschitz: products", products)
+    seed = SEED("estimate_lipschitz: seed", seed)
+    operator = CountedOperator("estimate_lipschitz: hvp", hvp)
     q, previous = random_unit_vector(like, seed), torch.zeros_like(like)
     diagonal: list[float] = []
     off_diagonal: list[float] = [0.0]
-    for _ in range(min(at_least("products", products, 1), like.numel())):
+    for _ in range(min(products, like.numel())):
         product = operator(q) - off_diagonal[-1] * previous
         diagonal.append(float(q @ product))
         product = product - diagonal[-1] * q
@@ -247,15 +254,6 @@ def _report(g: Tensor, operator: CountedOperator, rho: float, descent: _Descent)
     )
 
 
-def _lipschitz(operator: CountedOperator, like: Tensor, given: float | None) -> float:
-    """Return ℓ. Correction: the paper supposes it known; here it is estimated if not given."""
-    if given is None:
-        return estimate_lipschitz(operator, like)
-    if not (math.isfinite(given) and given >= 0):
-        raise ValueError(f"gradient_lipschitz is {given!r}; None or a finite number ≥ 0 is allowed")
-    return float(given)
-
-
 def _descent_steps(
     given: int | None, lipschitz: float, rho: float, epsilon: float, dim: int
 ) -> int:
@@ -266,7 +264,7 @@ def _descent_steps(
     √(ε/ρ) where the cubic term takes over.
     """
     if given is not None:
-        return at_least("max_steps", given, 1)
+        return given
     ratio = lipschitz / math.sqrt(rho * epsilon)
     growth = math.log1p(_STEP_DIVISOR * math.sqrt(dim) * ratio**2)
     return max(1, min(_MAX_STEPS, math.ceil(_STEP_DIVISOR * ratio * growth)))

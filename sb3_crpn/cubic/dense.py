@@ -4,18 +4,10 @@ import numpy as np
 import scipy.linalg
 import torch
 
+from sb3_crpn.arrays import ArrayLike, FloatArray, as_symmetric, as_vector
+from sb3_crpn.checks import POSITIVE
 from sb3_crpn.cubic.secular import solve_secular
-from sb3_crpn.cubic.step import (
-    EPS,
-    ROUNDING,
-    Array,
-    ArrayLike,
-    CubicStep,
-    as_symmetric,
-    as_vector,
-    positive,
-    residual_limit,
-)
+from sb3_crpn.cubic.step import EPS, ROUNDING, CubicStep, residual_limit
 
 # Relative residual of a certified step, as solve_krylov's default
 _TOL = 1e-8
@@ -53,11 +45,11 @@ def solve_dense(
     ValueError
         For a wrong shape, a non-finite entry, α ≤ 0, or M not positive definite.
     """
-    vector = as_vector("gradient", gradient)
-    alpha = positive("alpha", alpha)
-    g: Array = vector.cpu().numpy()
-    H = as_symmetric("hessian", hessian, len(g))
-    M = None if metric is None else as_symmetric("metric", metric, len(g))
+    vector = as_vector("solve_dense: gradient", gradient)
+    alpha = POSITIVE("solve_dense: alpha", alpha)
+    g: FloatArray = vector.cpu().numpy()
+    H = as_symmetric("solve_dense: hessian", hessian, len(g))
+    M = None if metric is None else as_symmetric("solve_dense: metric", metric, len(g))
 
     eigenvalues, V = _eigh(H, M)
     gamma = V.T @ g
@@ -85,7 +77,7 @@ def solve_dense(
     )
 
 
-def _eigh(H: Array, M: Array | None) -> tuple[Array, Array]:
+def _eigh(H: FloatArray, M: FloatArray | None) -> tuple[FloatArray, FloatArray]:
     """Return ascending eigenvalues and V of ``HV = MVΛ``; divide and conquer suits clusters."""
     if M is None:
         eigenvalues, V = scipy.linalg.eigh(H, driver="evd")
@@ -93,5 +85,7 @@ def _eigh(H: Array, M: Array | None) -> tuple[Array, Array]:
     try:
         eigenvalues, V = scipy.linalg.eigh(H, M, driver="gvd")
     except scipy.linalg.LinAlgError as error:
-        raise ValueError(f"metric is not positive definite ({error}); it must be") from error
+        raise ValueError(
+            f"solve_dense: metric is not positive definite ({error}), must be"
+        ) from error
     return eigenvalues, V

@@ -8,19 +8,15 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
+from sb3_crpn.arrays import ArrayLike, FloatArray, Operator, as_vector
+from sb3_crpn.checks import POSITIVE, SEED, integer
 from sb3_crpn.cubic.lanczos import KrylovSpace
 from sb3_crpn.cubic.secular import solve_secular
 from sb3_crpn.cubic.step import (
     EPS,
     ROUNDING,
-    Array,
-    ArrayLike,
     CountedOperator,
     CubicStep,
-    Operator,
-    as_vector,
-    at_least,
-    positive,
     random_unit_vector,
     residual_limit,
 )
@@ -39,7 +35,7 @@ _MAX_PRODUCTS = 1000
 class _Minimiser(NamedTuple):
     """Minimiser of the model over the space: ``coordinates`` [k], its residual, what bounds it."""
 
-    coordinates: Array
+    coordinates: FloatArray
     decrease: float
     residual: float
     limit: float
@@ -92,14 +88,16 @@ def solve_krylov(
         For a wrong shape, a non-finite number (products included), α ≤ 0, tol ≤ 0,
         max_products < 2.
     """
-    g = as_vector("gradient", gradient)
-    alpha, tol = positive("alpha", alpha), positive("tol", tol)
+    g = as_vector("solve_krylov: gradient", gradient)
+    alpha, tol = POSITIVE("solve_krylov: alpha", alpha), POSITIVE("solve_krylov: tol", tol)
+    seed = SEED("solve_krylov: seed", seed)
     if max_products is None:
         max_products = min(g.numel(), _MAX_PRODUCTS) + 1
-    budget = at_least("max_products", max_products, 2) - 1  # one is kept for the confirmation
+    # one is kept for the confirmation
+    budget = integer(2)("solve_krylov: max_products", max_products) - 1
     gradient_norm = float(torch.linalg.vector_norm(g))
 
-    space = KrylovSpace(CountedOperator("hvp", hvp), g)
+    space = KrylovSpace(CountedOperator("solve_krylov: hvp", hvp), g)
     if gradient_norm > 0:
         space.open(g)
     probe: int | None = None

@@ -4,15 +4,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sb3_crpn.cubic.step import (
-    EPS,
-    Array,
-    ArrayLike,
-    CountedOperator,
-    Operator,
-    as_vector,
-    at_least,
-)
+from sb3_crpn.arrays import ArrayLike, FloatArray, Operator, as_vector
+from sb3_crpn.checks import COUNT
+from sb3_crpn.cubic.step import EPS, CountedOperator
 
 # krylov_basis takes a space for invariant where the remainder is below this multiple of EPS·‖A‖:
 # repeated eigenvalues left 5 to 27 for d = 30 to 3000, once 150 for d = 10
@@ -35,7 +29,7 @@ class KrylovSpace:
         self.breakdown = breakdown
         self.dim = like.numel()
         self.size = 0
-        self.projected: Array = np.zeros((0, 0))
+        self.projected: FloatArray = np.zeros((0, 0))
         self.chains: list[list[int]] = []
         self.ends: list[Tensor | None] = []
         self.norm = 0.0  # the largest ‖Aq‖ so far
@@ -52,11 +46,11 @@ class KrylovSpace:
         self.ends.append(self._end(start, float(torch.linalg.vector_norm(start))))
         return len(self.chains) - 1
 
-    def extend(self, chain: int) -> None:
-        """Add the end of ``chain`` to the basis, at the cost of one product."""
+    def extend(self, chain: int) -> Tensor | None:
+        """Add the end q of ``chain`` to the basis and return Aq, one product; None at its end."""
         end = self.ends[chain]
         if end is None:
-            return
+            return None
         q = self._outside(end / torch.linalg.vector_norm(end))
         self._append(q / torch.linalg.vector_norm(q))
         self.chains[chain].append(self.size - 1)
@@ -68,6 +62,7 @@ class KrylovSpace:
         self.projected[-1, :] = self.projected[:, -1] = column
         self.ends[chain] = product
         self.ends = [None if e is None else self._end(e, self.norm) for e in self.ends]
+        return product
 
     def _append(self, row: Tensor) -> None:
         if self.size == len(self._rows):
@@ -86,11 +81,10 @@ class KrylovSpace:
         return vector - self.basis.T @ (self.basis @ vector)
 
 
-def krylov_basis(matvec: Operator, start: ArrayLike, dim: int) -> Tensor:
+def krylov_basis(matvec: Operator, start: ArrayLike, dim: int) -> tuple[Tensor, Tensor]:
     """Orthonormal basis of the Krylov space span{b, Ab, …, A^{dim-1}b}, A symmetric.
 
-    Lanczos with full reorthogonalisation. ``matvec`` is called exactly once per column, with
-    that column and in order, the last one included: a caller that records the products has AQ.
+    Lanczos with full reorthogonalisation, at one product a column.
 
     Parameters
     ----------
@@ -99,21 +93,27 @@ def krylov_basis(matvec: Operator, start: ArrayLike, dim: int) -> Tensor:
     start
         b, [d]. Zero spans nothing: k = 0.
     dim
-        Columns wanted, ≥ 1.
+        Columns wanted, ≥ 1; more than d are d.
 
     Returns
     -------
-    Tensor
-        Q, [d, k], float64, k ≤ dim; fewer where the space is invariant before.
+    tuple[Tensor, Tensor]
+        Q and AQ, [d, k], float64, k ≤ min(d, dim); fewer where the space is invariant before.
 
     Raises
     ------
     ValueError
         For an empty or non-finite ``start``, a non-finite product, dim < 1.
     """
-    vector = as_vector("start", start)
-    space = KrylovSpace(CountedOperator("matvec", matvec), vector, _BREAKDOWN)
+    vector = as_vector("krylov_basis: start", start)
+    size = min(vector.numel(), COUNT("krylov_basis: dim", dim))
+    space = KrylovSpace(CountedOperator("krylov_basis: matvec", matvec), vector, _BREAKDOWN)
     chain = space.open(vector)
-    for _ in range(at_least("dim", dim, 1)):
-        space.extend(chain)
-    return space.basis.T.contiguous()
+    images: list[Tensor] = []
+    for _ in range(size):
+        image = space.extend(chain)
+        if image is None:
+            break
+        images.append(image)
+    basis = space.basis.T.contiguous()
+    return basis, torch.stack(images, dim=1) if images else basis.clone()

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_crpn.cubic.step import Array
+from sb3_crpn.arrays import FloatArray
 
 # Measured on 40 000 generated problems: 2.0 in the mean, more than 7 in 0.1 %, at most 11
 _MAX_ITERATIONS = 50
@@ -17,12 +17,12 @@ _LAST_STEP = 1e-8
 class SecularSolution(NamedTuple):
     """Global minimiser y [k], the decrease -m(y) ≥ 0 and the iterations that it took."""
 
-    coordinates: Array
+    coordinates: FloatArray
     decrease: float
     iterations: int
 
 
-def solve_secular(eigenvalues: Array, gamma: Array, alpha: float) -> SecularSolution:
+def solve_secular(eigenvalues: FloatArray, gamma: FloatArray, alpha: float) -> SecularSolution:
     r"""Minimise the diagonal cubic model globally.
 
     .. math:: \min_y\; \gamma \cdot y + \tfrac12 \sum_i \lambda_i y_i^2 + \tfrac\alpha6 \|y\|^3
@@ -63,7 +63,7 @@ def solve_secular(eigenvalues: Array, gamma: Array, alpha: float) -> SecularSolu
     return SecularSolution(y * (unit / rho), decrease, iterations)
 
 
-def _root(a: Array, w: Array, shift: float) -> tuple[float, int]:
+def _root(a: FloatArray, w: FloatArray, shift: float) -> tuple[float, int]:
     """Solve ``‖w/(a + μ)‖ = μ + shift`` for μ ≥ 0; 0 if the left side is smaller there.
 
     1/‖s‖ is linearised and 1/λ kept exact: with n = ‖z‖, z = w/(a + μ), λ = μ + shift and
@@ -87,7 +87,7 @@ def _root(a: Array, w: Array, shift: float) -> tuple[float, int]:
     return mu, _MAX_ITERATIONS  # pragma: no cover
 
 
-def _lower_bound(a: Array, w: Array, shift: float) -> float:
+def _lower_bound(a: FloatArray, w: FloatArray, shift: float) -> float:
     """Return the largest root of the single equations ``(a_i + μ)(shift + μ) = |w_i|``, or 0."""
     size = np.abs(w)
     discriminant = np.sqrt((a - shift) ** 2 + 4 * size)
@@ -100,13 +100,13 @@ def _hard_case_length(length: float, shift: float) -> float:
     return math.sqrt(max(0.0, (shift - length) * (shift + length)))
 
 
-def _quotient(numerator: Array, denominator: Array) -> Array:
+def _quotient(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
     """Divide, with 0/0 = 0: a direction without gradient takes no part."""
-    out: Array = np.zeros_like(numerator)
+    out: FloatArray = np.zeros_like(numerator)
     return np.divide(numerator, denominator, out=out, where=numerator != 0)
 
 
-def _norm(x: Array) -> float:
+def _norm(x: FloatArray) -> float:
     """Euclidean norm without overflow or underflow of the squares."""
     largest = float(np.max(np.abs(x), initial=0.0))
     return largest * float(np.linalg.norm(x / largest)) if largest > 0 else 0.0

@@ -1,18 +1,14 @@
-"""What a cubic solver takes and returns: input checks, counted products, `CubicStep`."""
+"""What a cubic solver takes and returns: counted products, `CubicStep`."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-Array = NDArray[np.float64]
-ArrayLike = Tensor | NDArray[Any]
-Operator = Callable[[Tensor], Tensor]
+from sb3_crpn.arrays import Operator, require_finite
+from sb3_crpn.checks import CALLABLE
 
 EPS = float(np.finfo(np.float64).eps)
 
@@ -48,6 +44,9 @@ class CubicStep:
         How the solver ended, for people.
     lambda_min
         Leftmost (Ritz) value of H, relative to M, that the solver saw; NaN if it saw none.
+    at_sosp
+        Whether the model allows so small a decrease that the origin is an ε-second-order stationary
+        point: the early termination of Maniyar et al., Algorithm 2. Other solvers leave it False.
     """
 
     step: Tensor
@@ -58,6 +57,7 @@ class CubicStep:
     certified: bool
     status: str
     lambda_min: float = math.nan
+    at_sosp: bool = False
 
 
 class CountedOperator:
@@ -66,24 +66,28 @@ class CountedOperator:
     Raises
     ------
     ValueError
-        If a product has another shape than v or is not finite.
+        If it is not callable, or a product has another shape than v or is not finite.
     """
 
     def __init__(self, name: str, operator: Operator) -> None:
         self.name = name
         self.count = 0
-        self._operator = operator
+        self._operator: Operator = CALLABLE(name, operator)
 
     def __call__(self, vector: Tensor) -> Tensor:
         """Return Hv."""
         self.count += 1
-        product = torch.as_tensor(self._operator(vector)).detach().to(vector)
+        returned = self._operator(vector)
+        try:
+            product = torch.as_tensor(returned).detach().to(vector)
+        except (TypeError, ValueError, RuntimeError):
+            raise ValueError(f"{self.name} returned {returned!r}, must return a tensor") from None
         if product.shape != vector.shape:
             raise ValueError(
-                f"{self.name} returned shape {tuple(product.shape)}; "
-                f"{tuple(vector.shape)}, the shape of its argument, is required"
+                f"{self.name} returned shape {tuple(product.shape)}, "
+                f"must return that of its argument, {tuple(vector.shape)}"
             )
-        _require_finite(f"the product of {self.name}", product)
+        require_finite(f"the product of {self.name}", product)
         return product
 
 
@@ -92,49 +96,8 @@ def residual_limit(tol: float, gradient_norm: float, curvature: float, step_norm
     return max(tol * gradient_norm, ROUNDING * EPS * curvature * step_norm)
 
 
-def as_vector(name: str, value: ArrayLike) -> Tensor:
-    """Return ``value`` as a finite float64 Tensor[d] on its own device, or raise ValueError."""
-    vector = torch.as_tensor(value).detach().to(torch.float64)
-    if vector.ndim != 1 or vector.numel() == 0:
-        raise ValueError(f"{name} has shape {tuple(vector.shape)}; (d,) with d ≥ 1 is required")
-    _require_finite(name, vector)
-    return vector
-
-
-def as_symmetric(name: str, value: ArrayLike, dim: int) -> Array:
-    """Return the symmetric part of ``value`` as a finite array[dim, dim], or raise ValueError."""
-    matrix = torch.as_tensor(value).detach().to("cpu", torch.float64)
-    if matrix.shape != (dim, dim):
-        raise ValueError(f"{name} has shape {tuple(matrix.shape)}; ({dim}, {dim}) is required")
-    _require_finite(name, matrix)
-    symmetric: Array = ((matrix + matrix.T) / 2).numpy()
-    return symmetric
-
-
-def positive(name: str, value: float) -> float:
-    """Return ``value`` as a float if it is finite and > 0, or raise ValueError."""
-    number = float(value)
-    if not (math.isfinite(number) and number > 0):
-        raise ValueError(f"{name} is {value!r}; a finite number > 0 is required")
-    return number
-
-
-def at_least(name: str, value: int, minimum: int) -> int:
-    """Return ``value`` if it is an integer ≥ ``minimum``, or raise ValueError."""
-    if value != int(value) or value < minimum:
-        raise ValueError(f"{name} is {value!r}; an integer ≥ {minimum} is required")
-    return int(value)
-
-
 def random_unit_vector(like: Tensor, seed: int) -> Tensor:
     """Draw uniformly from the unit sphere of R^d, d, dtype and device as ``like``."""
     generator = torch.Generator().manual_seed(seed)
     vector = torch.randn(like.numel(), generator=generator, dtype=like.dtype).to(like.device)
     return vector / float(torch.linalg.vector_norm(vector))
-
-
-def _require_finite(name: str, value: Tensor) -> None:
-    finite = torch.isfinite(value)
-    if not bool(finite.all()):
-        bad = int((~finite).sum())
-        raise ValueError(f"{name} has {bad} NaN or infinite entries; finite numbers are required")

@@ -2,86 +2,22 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
 
-import numpy as np
 import torch
-from stable_baselines3.common.distributions import (
-    Distribution,
-    MultiCategoricalDistribution,
-    kl_divergence,
-)
+from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_crpn.episodes.batch import EpisodeBatch, FloatArray, IntArray, episode_scan, episode_starts
+from sb3_crpn.curvature.pair_weights import HessianEstimator
+from sb3_crpn.episodes.batch import EpisodeBatch
 from sb3_crpn.parameters import ActorParameters
-
-HessianEstimator = Literal["causal", "trajectory"]
+from sb3_crpn.policy import action_distribution, mean_divergence
 
 
 def policy_distribution(policy: ActorCriticPolicy, batch: EpisodeBatch) -> Distribution:
-    """Return π(·|s_i;θ) over the batch; a copy, because SB3's policies reuse one object."""
-    return copy.copy(policy.get_distribution(batch.observations))
-
-
-def mean_divergence(old: Distribution, new: Distribution) -> torch.Tensor:
-    """Return the mean of KL(old ‖ new) over the states and the action's k components, a scalar.
-
-    The mean, not the sum, over components is what sb3-contrib's TRPO bounds: a step of one and
-    the same divergence changes each component as much whether there are one or twenty.
-    """
-    divergence = kl_divergence(old, new)  # [T], or [T, k] where SB3 keeps the components apart
-    if isinstance(old, MultiCategoricalDistribution):  # which SB3 sums
-        divergence = divergence / len(old.action_dims)
-    return divergence.mean()
-
-
-@dataclass(frozen=True)
-class PairWeights:
-    """The symmetric pair weights W of a Hessian estimator, applied in O(T).
-
-    - ``"trajectory"``: W_ij = ½(A_i + A_j), the symmetric part of the paper's estimator
-      (Maniyar et al., Theorem 1).
-    - ``"causal"``: W_ij = κ^|i-j| A_max(i,j). κ = 1 is the Hessian of the DiCE objective (Foerster
-      et al., ICML 2018) and of Furmston et al., JMLR 2016; κ = 0 keeps the curvature of the
-      per-step surrogate alone.
-    """
-
-    estimator: HessianEstimator
-    decay: float = 1.0
-
-    def apply(self, weights: FloatArray, lengths: IntArray, u: FloatArray) -> FloatArray:
-        """Return w_i = Σ_j W_ij u_j, the sum over j within the episode of i, [T] or [T, k].
-
-        Parameters
-        ----------
-        weights
-            A_i, [T], episodes end to end.
-        lengths
-            Steps of each episode, [E].
-        u
-            u_j, [T], or k such vectors, [T, k].
-        """
-        weights = weights.reshape(-1, *[1] * (u.ndim - 1))
-        if self.estimator == "trajectory":
-            return 0.5 * (
-                weights * _episode_totals(u, lengths) + _episode_totals(weights * u, lengths)
-            )
-        # j ≤ i: A_i Σ κ^(i-j) u_j;  j > i: Σ κ^(j-i) A_j u_j
-        past = episode_scan(u, self.decay, lengths)
-        weighted = weights * u
-        future = episode_scan(weighted, self.decay, lengths, reverse=True) - weighted
-        return weights * past + future
-
-
-def _episode_totals(values: FloatArray, lengths: IntArray) -> FloatArray:
-    """Return for each step the sum of ``values`` over its episode, [T] or [T, k]."""
-    totals: FloatArray = np.add.reduceat(values, episode_starts(lengths), axis=0)
-    return totals.repeat(lengths, axis=0)
+    """Return π(·|s_i;θ) over the batch."""
+    return action_distribution(policy, batch.observations)
 
 
 class EpisodeDerivatives:
@@ -96,8 +32,8 @@ class EpisodeDerivatives:
         The policy at θ and its actor's parameters.
     batch
         The episodes with their weights A_i.
-    pair_weights
-        W of the Hessian estimator.
+    estimator
+        Brings the pair weights W.
     """
 
     def __init__(
@@ -105,12 +41,12 @@ class EpisodeDerivatives:
         policy: ActorCriticPolicy,
         actor: ActorParameters,
         batch: EpisodeBatch,
-        pair_weights: PairWeights,
+        estimator: HessianEstimator,
     ) -> None:
         self.batch = batch
         self._policy = policy
         self._actor = actor
-        self._pair_weights = pair_weights
+        self._estimator = estimator
 
     @cached_property
     def _distribution(self) -> Distribution:
@@ -148,7 +84,7 @@ class EpisodeDerivatives:
     def gradient(self) -> torch.Tensor:
         """Return (1/n) Σ_episodes Σ_i A_i σ_i, [d] (Theorem 1)."""
         _, score = self._weighted_score
-        return self._actor.flatten(s.detach() for s in score) / self.batch.n_episodes
+        return self._actor.flatten(s.detach() for s in score) / self.batch.size
 
     def hessian_product(self, vector: torch.Tensor) -> torch.Tensor:
         """Return (1/n) Σ_episodes [Σ_ij W_ij σ_i σ_jᵀ + Σ_i A_i ∇²log π_i] v, [d].
@@ -157,7 +93,7 @@ class EpisodeDerivatives:
         Σ A_i σ_i·v is linear in A, one backward pass gives both u and the second term.
         """
         u, curvature = self._along(vector)
-        w = self._pair_weights.apply(
+        w = self._estimator.apply(
             self.batch.cost_advantages, self.batch.lengths, u.to("cpu", torch.float64).numpy()
         )
         outer = torch.autograd.grad(
@@ -167,7 +103,7 @@ class EpisodeDerivatives:
             retain_graph=True,
             materialize_grads=True,
         )
-        return (self._actor.flatten(outer) + curvature) / self.batch.n_episodes
+        return (self._actor.flatten(outer) + curvature) / self.batch.size
 
     def quadratic_form(self, basis: torch.Tensor) -> torch.Tensor:
         """Return VᵀHV for V = ``basis`` [d, k], H as in :meth:`hessian_product`, [k, k].
@@ -180,8 +116,8 @@ class EpisodeDerivatives:
             for columns in zip(*(self._along(vector) for vector in basis.T), strict=True)
         )
         U = u.to("cpu", torch.float64).numpy()
-        outer = U.T @ self._pair_weights.apply(self.batch.cost_advantages, self.batch.lengths, U)
-        return (torch.from_numpy(outer).to(basis) + basis.T @ curvature) / self.batch.n_episodes
+        outer = U.T @ self._estimator.apply(self.batch.cost_advantages, self.batch.lengths, U)
+        return (torch.from_numpy(outer).to(basis) + basis.T @ curvature) / self.batch.size
 
     def _along(self, vector: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return u = Jv, [T], and ∇(Σ_i A_i σ_i·v), [d], by one backward pass."""

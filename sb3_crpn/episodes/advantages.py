@@ -1,4 +1,4 @@
-"""Generalised advantages, and the weights A_i that the estimators take."""
+"""Generalised advantages, and the cost advantages A_i that the estimators take."""
 
 from __future__ import annotations
 
@@ -7,14 +7,8 @@ import math
 import numpy as np
 from scipy.linalg import solve_banded
 
-from sb3_crpn.distributed import mean_and_variance
-from sb3_crpn.episodes.batch import (
-    FloatArray,
-    IntArray,
-    episode_scan,
-    episode_starts,
-    episode_time,
-)
+from sb3_crpn.arrays import FloatArray, IntArray
+from sb3_crpn.episodes.batch import episode_scan, episode_starts, episode_time, moments
 
 
 def generalized_advantages(
@@ -24,7 +18,7 @@ def generalized_advantages(
     lengths: IntArray,
     gamma: float,
     gae_lambda: float,
-    traces: FloatArray | None = None,
+    clipped_ratios: FloatArray | None = None,
 ) -> FloatArray:
     """Return GAE(λ) advantages Σ_l (γλ)^l c_{i+1}⋯c_{i+l} δ_{i+l}, [T].
 
@@ -35,10 +29,10 @@ def generalized_advantages(
     rewards, values
         r_i and V(s_i), [T].
     terminal_values
-        V of the state after each episode's last step, [E]: 0 where the episode terminated.
-    traces
-        c_i in [0, 1], [T]: how far to trust what another policy did at step i, as in Retrace and
-        V-trace; ``None``: 1.
+        V of the state after each segment's last step, [E]: 0 where the trajectory terminated.
+    clipped_ratios
+        c_i = min(1, π(a_i|s_i)/μ(a_i|s_i)), [T], μ the behaviour policy, as in Retrace and V-trace;
+        ``None``: 1.
 
     References
     ----------
@@ -48,7 +42,7 @@ def generalized_advantages(
     last = episode_starts(lengths) + lengths - 1
     next_values = np.append(values[1:], 0.0)
     next_values[last] = terminal_values
-    if traces is None:
+    if clipped_ratios is None:
         # the λ-returns, then V: at λ = 1 nothing of V is left in the former, not even its rounding
         sources = rewards + gamma * (1.0 - gae_lambda) * next_values
         sources[last] += gamma * gae_lambda * terminal_values
@@ -58,7 +52,7 @@ def generalized_advantages(
         return delta
     # y_i - γλ c_{i+1} y_{i+1} = δ_i within each episode: one bidiagonal system
     bands = np.ones((2, len(delta)))
-    bands[0, 1:] = -gamma * gae_lambda * traces[1:]
+    bands[0, 1:] = -gamma * gae_lambda * clipped_ratios[1:]
     bands[0, episode_starts(lengths)] = 0.0
     advantages: FloatArray = solve_banded((0, 1), bands, delta, check_finite=False)
     return advantages
@@ -67,19 +61,21 @@ def generalized_advantages(
 def cost_advantages(
     advantages: FloatArray,
     lengths: IntArray,
+    times: IntArray,
     *,
     gamma: float,
     normalize_advantage: bool,
     discount_visitation: bool,
 ) -> FloatArray:
-    """Return A_i = -γ^i Â_i, [T].
+    """Return A_i = -γ^i Â_i, i the time in the trajectory, [T].
 
-    Â is normalised to mean 0 and standard deviation 1 over the batch of all ranks on request;
-    without ``discount_visitation`` the factor γ^i is dropped.
+    ``times``, [E], is that of each segment's first step. Â is normalised to mean 0 and standard
+    deviation 1 over the batch of all ranks on request; without ``discount_visitation`` the factor
+    γ^i is dropped.
     """
     if normalize_advantage:
-        mean, variance = mean_and_variance(advantages)
+        mean, variance = moments(advantages)
         advantages = (advantages - mean) / (math.sqrt(variance) + 1e-8)  # 1e-8: as in SB3's PPO
     if discount_visitation:
-        advantages = advantages * gamma ** episode_time(lengths)
+        advantages = advantages * gamma ** episode_time(lengths, times)
     return -advantages

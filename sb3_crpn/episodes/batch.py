@@ -1,28 +1,25 @@
-"""A batch of whole episodes laid end to end, and linear recursions over it."""
+"""A batch of segments of trajectories laid end to end, and linear recursions over it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, TypeAlias
+from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 import torch
-from scipy.signal import lfilter
 
+from sb3_crpn.arrays import FloatArray, IntArray, Observations
 from sb3_crpn.distributed import (
     all_max,
     all_sum,
     broadcast,
     gather_counts,
+    local_count,
     mean_and_variance,
     rank,
+    world_size,
 )
-
-FloatArray: TypeAlias = npt.NDArray[np.float64]
-IntArray: TypeAlias = npt.NDArray[np.int64]
-Observations: TypeAlias = torch.Tensor | dict[str, torch.Tensor]
 
 
 def episode_starts(lengths: IntArray) -> IntArray:
@@ -30,9 +27,13 @@ def episode_starts(lengths: IntArray) -> IntArray:
     return np.cumsum(lengths) - lengths
 
 
-def episode_time(lengths: IntArray) -> IntArray:
-    """Return the time i = 0, 1, … of each step within its episode, [T]."""
-    time: IntArray = np.arange(lengths.sum()) - np.repeat(episode_starts(lengths), lengths)
+def episode_time(lengths: IntArray, times: IntArray | int = 0) -> IntArray:
+    """Return the time of each step in its trajectory, [T].
+
+    ``times``, [E], is that of each segment's first step: 0 for whole episodes.
+    """
+    offsets: IntArray = times - episode_starts(lengths)
+    time: IntArray = np.arange(lengths.sum()) + np.repeat(offsets, lengths)
     return time
 
 
@@ -48,13 +49,35 @@ def episode_chunks(lengths: IntArray, max_steps: int) -> list[slice]:
     return runs
 
 
-def round_robin_split(n_episodes: int, n_groups: int, first: int = 0) -> list[IntArray]:
-    """Deal episodes in turn to the groups, beginning with group ``first`` mod ``n_groups``.
+def round_robin_split(trajectories: IntArray, n_folds: int, first: int = 0) -> list[IntArray]:
+    """Split segments into folds: the segments of one trajectory belong to one fold.
 
-    The episodes are independent and identically distributed, so any split that does not look at
-    them is a random one.
+    Trajectories go to the folds in turn, beginning with fold ``first`` mod ``n_folds``, in the
+    order in which they first appear. They are independent and identically distributed, so that
+    any split that does not look at them is a random one.
+
+    Parameters
+    ----------
+    trajectories
+        The trajectory of each segment, [E].
+    n_folds, first
+        The number of folds, and the one that the first trajectory goes to.
+
+    Returns
+    -------
+    list[IntArray]
+        The segments of each fold, ascending.
     """
-    return [np.arange((k - first) % n_groups, n_episodes, n_groups) for k in range(n_groups)]
+    _, first_seen, index = np.unique(trajectories, return_index=True, return_inverse=True)
+    order = np.empty(len(first_seen), dtype=np.int64)
+    order[np.argsort(first_seen)] = np.arange(len(first_seen))
+    fold = (order[index] + first) % n_folds
+    return [np.flatnonzero(fold == k) for k in range(n_folds)]
+
+
+def moments(values: FloatArray) -> tuple[float, float]:
+    """Return mean and variance of the union of the ranks' arrays, [n]."""
+    return mean_and_variance(values)
 
 
 def episode_scan(
@@ -85,6 +108,8 @@ def episode_scan(
         return values
     if reverse:
         return episode_scan(values[::-1], factor, lengths[::-1])[::-1]
+    from scipy.signal import lfilter  # here: the import takes a second
+
     filtered: FloatArray = lfilter([1.0], [1.0, -factor], values, axis=0)
     inherited = np.zeros((len(lengths), *filtered.shape[1:]))
     inherited[1:] = filtered[episode_starts(lengths)[1:] - 1]
@@ -96,7 +121,9 @@ def episode_scan(
 
 @dataclass(frozen=True)
 class EpisodeBatch:
-    """E whole episodes of T steps in all, laid end to end.
+    """E segments of trajectories, T steps in all, laid end to end.
+
+    A whole episode is the segment that starts at time 0 and ends by itself.
 
     With several ranks a batch is the union of what they hold, and each sees its own part. What is
     to be known of the union goes through this class: all ranks must then ask for it.
@@ -116,7 +143,13 @@ class EpisodeBatch:
     log_probs
         log π(a_i|s_i) of the policy that acted, [T].
     terminal_values
-        V of the state after each episode's last step, [E]: 0 where it is not bootstrapped.
+        V of the state after each segment's last step, [E]: 0 where it is not bootstrapped.
+    times
+        The time of each segment's first step in its trajectory, [E].
+    trajectories
+        The number of each segment's trajectory, [E]; equal numbers are one trajectory.
+    unit
+        What derivatives of J are means over: whole episodes, "n_episodes", or "n_steps".
     """
 
     observations: Observations
@@ -128,16 +161,29 @@ class EpisodeBatch:
     rewards: FloatArray
     log_probs: FloatArray
     terminal_values: FloatArray
+    times: IntArray
+    trajectories: IntArray
+    unit: Literal["n_episodes", "n_steps"] = "n_episodes"
 
     @property
     def n_episodes(self) -> int:
-        """E, the number of episodes."""
+        """E, the number of segments."""
         return len(self.lengths)
 
     @property
     def n_steps(self) -> int:
         """T, the number of steps."""
         return len(self.cost_advantages)
+
+    @property
+    def size(self) -> int:
+        """The number of ``unit``s, by which sums over steps are divided."""
+        return self.n_steps if self.unit == "n_steps" else self.n_episodes
+
+    @property
+    def n_trajectories(self) -> int:
+        """The number of trajectories that the segments belong to."""
+        return len(np.unique(self.trajectories))
 
     @property
     def total_episodes(self) -> int:
@@ -149,10 +195,23 @@ class EpisodeBatch:
         """The number of steps that all ranks hold; every rank must ask."""
         return sum(gather_counts(self.n_steps))
 
+    def folds(self, n_folds: int) -> list[IntArray]:
+        """Split the trajectories of all ranks into at most ``n_folds``; return this rank's part.
+
+        See :func:`round_robin_split`; every rank must ask.
+        """
+        counts = gather_counts(self.n_trajectories)
+        n_folds = max(1, min(n_folds, sum(counts)))
+        return round_robin_split(self.trajectories, n_folds, first=sum(counts[: rank()]))
+
     @property
-    def preceding_episodes(self) -> int:
-        """The number of episodes on the ranks before this one; every rank must ask."""
-        return sum(gather_counts(self.n_episodes)[: rank()])
+    def is_whole(self) -> bool:
+        """Whether this process holds the whole batch: a run on one process."""
+        return world_size() == 1
+
+    def share(self, n_episodes: int) -> int:
+        """Return this rank's share of ``n_episodes`` that are dealt out evenly."""
+        return local_count(n_episodes)
 
     def total(self, part: torch.Tensor) -> torch.Tensor:
         """Return the sum of a quantity whose ``part`` this rank's episodes make up."""
@@ -168,7 +227,7 @@ class EpisodeBatch:
 
     def moments(self, values: FloatArray) -> tuple[float, float]:
         """Return mean and variance over the steps of all ranks of ``values``, [T]."""
-        return mean_and_variance(values)
+        return moments(values)
 
     def take(self, episodes: IntArray) -> EpisodeBatch:
         """Return the batch of the chosen episodes, in the order given."""
@@ -176,12 +235,12 @@ class EpisodeBatch:
         steps = np.repeat(episode_starts(self.lengths)[episodes], lengths) + episode_time(lengths)
         return self._select(episodes, steps)
 
-    def split(self, n_groups: int) -> list[EpisodeBatch]:
-        """Deal the episodes to at most ``n_groups`` batches, none of them empty."""
-        n_groups = min(n_groups, self.n_episodes)
-        if n_groups == 1:
+    def split(self, n_folds: int) -> list[EpisodeBatch]:
+        """Split this rank's trajectories into at most ``n_folds`` batches, none of them empty."""
+        n_folds = min(n_folds, self.n_trajectories)
+        if n_folds == 1:
             return [self]
-        return [self.take(episodes) for episodes in round_robin_split(self.n_episodes, n_groups)]
+        return [self.take(fold) for fold in round_robin_split(self.trajectories, n_folds)]
 
     def chunks(self, max_steps: int | None) -> list[EpisodeBatch]:
         """Cut the batch, as :func:`episode_chunks` does, into batches that share its memory."""
@@ -204,6 +263,9 @@ class EpisodeBatch:
             rewards=self.rewards[steps],
             log_probs=self.log_probs[steps],
             terminal_values=self.terminal_values[episodes],
+            times=self.times[episodes],
+            trajectories=self.trajectories[episodes],
+            unit=self.unit,
         )
 
 
@@ -214,8 +276,9 @@ def concatenate(batches: Sequence[EpisodeBatch]) -> EpisodeBatch:
     joined: dict[str, Any] = {
         field.name: _join([getattr(batch, field.name) for batch in batches])
         for field in fields(EpisodeBatch)
+        if field.name != "unit"
     }
-    return EpisodeBatch(**joined)
+    return EpisodeBatch(**joined, unit=batches[0].unit)
 
 
 def _join(parts: Sequence[Any]) -> Any:

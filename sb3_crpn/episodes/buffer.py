@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import DictRolloutBufferSamples, RolloutBufferSamples
 
-from sb3_crpn.distributed import all_sum
+from sb3_crpn.arrays import Array, FloatArray, IntArray, Observations
 from sb3_crpn.episodes.advantages import cost_advantages, generalized_advantages
-from sb3_crpn.episodes.batch import EpisodeBatch, IntArray, Observations, episode_time
-from sb3_crpn.episodes.tracker import EpisodeEnd
+from sb3_crpn.episodes.batch import EpisodeBatch, episode_time
+from sb3_crpn.episodes.tracker import Segment
+from sb3_crpn.policy import state_values, to_tensor, values_and_log_probs
 
 # Steps in one forward pass that evaluates: enough to be efficient, of bounded memory
 CHUNK = 4096
@@ -25,136 +25,180 @@ _ARRAYS = ("actions", "rewards", "returns", "episode_starts", "values", "log_pro
 
 
 class EpisodeRolloutBuffer(RolloutBuffer):
-    """A rollout buffer that grows, and knows which of its steps make up the kept episodes.
+    """A rollout buffer that grows, and knows the segments of trajectories that its steps make up.
 
-    The arrays are SB3's, [capacity, n_envs, …], of which the first ``pos`` rows are filled;
-    ``buffer_size`` is the initial capacity and doubles whenever it is met. Steps outside the kept
-    episodes stay in the arrays and are never read again.
+    The arrays are SB3's, [rows, n_envs, …]. During a rollout their capacity doubles whenever it is
+    met; :meth:`finish` cuts them to what was collected. Steps outside the segments (of episodes
+    beyond an environment's quota) stay in the arrays with SB3's own estimates, and are not learnt
+    from.
     """
 
     def reset(self) -> None:
-        """Forget all steps and episodes; the capacity stays."""
+        """Forget all steps and segments; the capacity stays."""
         super().reset()
-        self._ends: list[EpisodeEnd] = []
-        self._terminal_values: list[float] = []
+        self._segments: list[Segment] = []
+        self._next_observations: list[Any] = []
+        self._terminal_values: FloatArray = np.zeros(0)
+        self._float64_advantages: FloatArray = np.zeros(0)
 
     def add(self, *args: Any, **kwargs: Any) -> None:
         """Store one step of every environment, as :meth:`RolloutBuffer.add` does."""
         if self.pos == self.buffer_size:
-            self._grow()
+            self._resize(lambda array: np.concatenate([array, np.zeros_like(array)]))
         super().add(*args, **kwargs)
 
-    def _grow(self) -> None:
+    def _resize(self, change: Callable[[Array], Array]) -> None:
         for name in _ARRAYS:
-            setattr(self, name, _doubled(getattr(self, name)))
+            setattr(self, name, change(getattr(self, name)))
         if isinstance(self.observations, dict):
             for key, array in self.observations.items():
-                self.observations[key] = _doubled(array)
+                self.observations[key] = change(array)
         else:
-            self.observations = _doubled(self.observations)
-        self.buffer_size *= 2
+            self.observations = change(self.observations)
+        self.buffer_size = len(self.rewards)
 
-    def close_episode(self, end: EpisodeEnd, terminal_value: float) -> None:
-        """Keep an episode that ended with the step just added.
+    def close(self, segment: Segment, next_observation: Any = None) -> None:
+        """Keep a segment that ended with the step just added.
 
-        ``terminal_value`` is V of the state after it, 0 unless a time limit's value is
-        bootstrapped.
+        ``next_observation`` is the state after it, whose value it is bootstrapped with; ``None``
+        after a terminal state.
         """
-        self._ends.append(end)
-        self._terminal_values.append(terminal_value)
+        self._segments.append(segment)
+        self._next_observations.append(next_observation)
+
+    def finish(self, policy: ActorCriticPolicy | None, last_observations: Any) -> None:
+        """Cut the arrays to the steps collected, and estimate values and advantages.
+
+        V and log π are asked for once a rollout, where SB3 asks at every step.
+
+        Parameters
+        ----------
+        policy
+            The policy that acted; ``None`` where V is not used: V = 0, and log π is not needed.
+        last_observations
+            The environments' observations after the last step.
+        """
+        self._resize(lambda array: array[: self.pos])
+        self.full = True
+        valid = self._valid_steps()
+        if policy is not None:
+            self._evaluate(policy, *valid)
+        self._terminal_values = self._bootstrapped(policy)
+        if len(valid[0]) < self.rewards.size:
+            self._estimate_all(policy, last_observations, valid)
+        self._compute_advantages(*valid)
 
     @property
     def lengths(self) -> IntArray:
-        """Steps of each kept episode, [E]."""
-        return np.array([end.length for end in self._ends], dtype=np.int64)
+        """Steps of each segment, [E]."""
+        return self._of_segments("length")
 
-    @property
-    def used_fraction(self) -> float:
-        """Share of the steps simulated by all ranks that belong to kept episodes."""
-        steps = torch.tensor([self.lengths.sum(), self.pos * self.n_envs], dtype=torch.float64)
-        kept, simulated = all_sum(steps).tolist()
-        return float(kept / simulated)
+    def _of_segments(self, name: str) -> IntArray:
+        return np.array([getattr(segment, name) for segment in self._segments], dtype=np.int64)
 
-    def _kept_steps(self) -> tuple[IntArray, IntArray]:
-        """Return the (row, environment) of every kept step, episodes end to end."""
+    def _valid_steps(self) -> tuple[IntArray, IntArray]:
+        """Return the (row, environment) of every segment's steps, segments end to end."""
         lengths = self.lengths
-        starts = np.array([end.start for end in self._ends], dtype=np.int64)
-        envs = np.array([end.env for end in self._ends], dtype=np.int64)
+        starts, envs = self._of_segments("start"), self._of_segments("env")
         return np.repeat(starts, lengths) + episode_time(lengths), np.repeat(envs, lengths)
 
-    def evaluate(self, policy: ActorCriticPolicy) -> None:
-        """Fill ``values`` and ``log_probs`` of the kept steps from the policy that acted.
-
-        SB3 asks for both at every step of a rollout; asking once spares most of that time.
-        """
-        rows, envs = self._kept_steps()
+    def _evaluate(self, policy: ActorCriticPolicy, rows: IntArray, envs: IntArray) -> None:
+        """Fill ``values`` and ``log_probs`` of the steps given."""
         for start in range(0, len(rows), CHUNK):
-            kept = rows[start : start + CHUNK], envs[start : start + CHUNK]
-            with torch.no_grad():
-                values, log_probs, _ = policy.evaluate_actions(
-                    self._gather_observations(kept),
-                    self._gather_actions(kept),
-                )
-            self.values[kept] = values.flatten().cpu().numpy()
-            self.log_probs[kept] = log_probs.cpu().numpy()
+            steps = rows[start : start + CHUNK], envs[start : start + CHUNK]
+            values, log_probs = values_and_log_probs(
+                policy, self._gather_observations(steps), self._gather_actions(steps)
+            )
+            self.values[steps] = values.cpu().numpy()
+            self.log_probs[steps] = log_probs.cpu().numpy()
 
-    def compute_advantages(self) -> None:
-        """Fill ``advantages`` with GAE(λ) and ``returns`` with the λ-return of each kept step."""
-        kept = self._kept_steps()
-        values = self.values[kept].astype(np.float64)
-        advantages = generalized_advantages(
-            self.rewards[kept].astype(np.float64),
+    def _bootstrapped(self, policy: ActorCriticPolicy | None) -> FloatArray:
+        """Return V of the state after each segment, [E]; 0 after a terminal state."""
+        values = np.zeros(len(self._segments))
+        known = [i for i, obs in enumerate(self._next_observations) if obs is not None]
+        for start in range(0, len(known), CHUNK):
+            chosen = known[start : start + CHUNK]
+            stacked = stack_observations([self._next_observations[i] for i in chosen])
+            assert policy is not None  # by uses_critic, where anything is bootstrapped
+            values[chosen] = values_of(policy, stacked)
+        return values
+
+    def _estimate_all(
+        self,
+        policy: ActorCriticPolicy | None,
+        last_observations: Any,
+        valid: tuple[IntArray, IntArray],
+    ) -> None:
+        """Fill the other steps' values, returns and advantages as SB3 does: callbacks read them."""
+        others = np.ones(self.rewards.shape, dtype=np.bool_)
+        others[valid] = False
+        last_values = np.zeros(self.n_envs)
+        if policy is not None:
+            self._evaluate(policy, *np.nonzero(others))
+            last_values = values_of(policy, last_observations)
+        self.compute_returns_and_advantage(torch.as_tensor(last_values), np.zeros(self.n_envs))
+
+    def _compute_advantages(self, rows: IntArray, envs: IntArray) -> None:
+        """Fill ``advantages`` with GAE(λ) and ``returns`` with the λ-return of each valid step."""
+        valid = rows, envs
+        values = self.values[valid].astype(np.float64)
+        self._float64_advantages = generalized_advantages(
+            self.rewards[valid].astype(np.float64),
             values,
-            np.array(self._terminal_values),
+            self._terminal_values,
             self.lengths,
             self.gamma,
             self.gae_lambda,
         )
-        self.advantages[kept] = advantages
-        self.returns[kept] = advantages + values
+        self.advantages[valid] = self._float64_advantages
+        self.returns[valid] = self._float64_advantages + values
 
     def episode_batch(
         self, *, baseline: bool, normalize_advantage: bool, discount_visitation: bool
     ) -> EpisodeBatch:
-        """Return the kept episodes with the weights of :func:`cost_advantages`.
+        """Return the segments with the cost advantages of :func:`cost_advantages`.
 
         Â is the advantage, or the λ-return where ``baseline`` is false.
         """
-        kept = self._kept_steps()
-        lengths = self.lengths
-        weights = cost_advantages(
-            (self.advantages if baseline else self.returns)[kept].astype(np.float64),
-            lengths,
-            gamma=self.gamma,
-            normalize_advantage=normalize_advantage,
-            discount_visitation=discount_visitation,
-        )
+        valid = self._valid_steps()
+        values = self.values[valid].astype(np.float64)
+        returns = self._float64_advantages + values
+        times = self._of_segments("time")
         return EpisodeBatch(
-            observations=self._gather_observations(kept),
-            actions=self._gather_actions(kept),
-            lengths=lengths,
-            cost_advantages=weights,
-            values=self.values[kept].astype(np.float64),
-            returns=self.returns[kept].astype(np.float64),
-            rewards=self.rewards[kept].astype(np.float64),
-            log_probs=self.log_probs[kept].astype(np.float64),
-            terminal_values=np.array(self._terminal_values),
+            observations=self._gather_observations(valid),
+            actions=self._gather_actions(valid),
+            lengths=self.lengths,
+            cost_advantages=cost_advantages(
+                self._float64_advantages if baseline else returns,
+                self.lengths,
+                times,
+                gamma=self.gamma,
+                normalize_advantage=normalize_advantage,
+                discount_visitation=discount_visitation,
+            ),
+            values=values,
+            returns=returns,
+            rewards=self.rewards[valid].astype(np.float64),
+            log_probs=self.log_probs[valid].astype(np.float64),
+            terminal_values=self._terminal_values,
+            times=times,
+            trajectories=self._of_segments("trajectory") * self.n_envs + self._of_segments("env"),
         )
 
-    def _gather_observations(self, kept: tuple[IntArray, IntArray]) -> Observations:
+    def _gather_observations(self, steps: tuple[IntArray, IntArray]) -> Observations:
         if isinstance(self.observations, dict):
-            return {key: self.to_torch(array[kept]) for key, array in self.observations.items()}
-        return self.to_torch(self.observations[kept])
+            return {key: self.to_torch(array[steps]) for key, array in self.observations.items()}
+        return self.to_torch(self.observations[steps])
 
-    def _gather_actions(self, kept: tuple[IntArray, IntArray]) -> torch.Tensor:
-        actions = self.to_torch(self.actions[kept].astype(np.float32, copy=False))
+    def _gather_actions(self, steps: tuple[IntArray, IntArray]) -> torch.Tensor:
+        actions = self.to_torch(self.actions[steps].astype(np.float32, copy=False))
         if isinstance(self.action_space, spaces.Discrete):
             return actions.long().flatten()
         return actions
 
     def get(self, batch_size: int | None = None) -> Generator[Any, None, None]:
-        """Yield the kept steps once, in random minibatches, as SB3's buffers do."""
-        rows, envs = self._kept_steps()
+        """Yield the valid steps once, in random minibatches, as SB3's buffers do."""
+        rows, envs = self._valid_steps()
         order = np.random.permutation(len(rows))  # noqa: NPY002 the generator of SB3's buffers
         size = len(rows) if batch_size is None else batch_size
         for start in range(0, len(rows), size):
@@ -162,12 +206,12 @@ class EpisodeRolloutBuffer(RolloutBuffer):
             yield self._samples((rows[chosen], envs[chosen]))
 
     def _samples(
-        self, kept: tuple[IntArray, IntArray]
+        self, steps: tuple[IntArray, IntArray]
     ) -> RolloutBufferSamples | DictRolloutBufferSamples:
-        actions = self.to_torch(self.actions[kept].astype(np.float32, copy=False))
+        actions = self.to_torch(self.actions[steps].astype(np.float32, copy=False))
         arrays = (self.values, self.log_probs, self.advantages, self.returns)
-        observations = self._gather_observations(kept)
-        rest = (actions, *(self.to_torch(array[kept]) for array in arrays))
+        observations = self._gather_observations(steps)
+        rest = (actions, *(self.to_torch(array[steps]) for array in arrays))
         if isinstance(observations, dict):
             return DictRolloutBufferSamples(observations, *rest)
         return RolloutBufferSamples(observations, *rest)
@@ -177,6 +221,18 @@ class DictEpisodeRolloutBuffer(EpisodeRolloutBuffer, DictRolloutBuffer):
     """:class:`EpisodeRolloutBuffer` for dict observations."""
 
 
-def _doubled(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return ``array`` followed by as many rows again."""
-    return np.concatenate([array, np.zeros_like(array)])
+def stack_observations(observations: list[Any]) -> Any:
+    """Lay single observations of equal shapes, arrays or dicts of them, along a first axis."""
+    if isinstance(observations[0], dict):
+        return {
+            key: np.stack([observation[key] for observation in observations])
+            for key in observations[0]
+        }
+    return np.stack(observations)
+
+
+def values_of(policy: ActorCriticPolicy, observations: Any) -> FloatArray:
+    """Return V of a batch of an environment's observations, float64 [n]."""
+    with torch.no_grad():
+        values = state_values(policy, to_tensor(policy, observations))
+    return values.cpu().double().numpy()

@@ -1,4 +1,4 @@
-"""Earlier rollouts, from which later updates learn again."""
+"""Replay: earlier rollouts, reweighted to the present policy."""
 
 from __future__ import annotations
 
@@ -9,33 +9,34 @@ import numpy as np
 import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_crpn.distributed import all_sum
+from sb3_crpn.arrays import FloatArray
 from sb3_crpn.episodes.advantages import cost_advantages, generalized_advantages
-from sb3_crpn.episodes.batch import EpisodeBatch, FloatArray
+from sb3_crpn.episodes.batch import EpisodeBatch
 from sb3_crpn.episodes.buffer import CHUNK
+from sb3_crpn.policy import values_and_log_probs
 
 # ρ̄, where importance ratios are truncated (Ionides, Truncated importance sampling, 2008): bounds
 # their variance, and leaves untouched what a few steps of the usual target_kl do to most actions
 MAX_RATIO = 2.0
-# Effective sample size, relative to the rollout's size, below which a rollout is forgotten: where
+# Effective sample size, relative to the rollout's size, below which a rollout is dropped: where
 # sequential Monte Carlo resamples (Liu and Chen, Blind deconvolution via sequential imputations,
 # JASA 1995)
 MIN_EFFECTIVE_SIZE = 0.5
 
 
 class Replay:
-    """The last rollouts, reweighted to the present policy on demand.
+    """The last rollouts, importance-weighted to the present policy π on demand.
 
-    With ρ_i = π(a_i|s_i)/π_then(a_i|s_i) and c_i = min(1, ρ_i), a step counts with
+    With μ the behaviour policy of a rollout, ρ_i = π(a_i|s_i)/μ(a_i|s_i) and c_i = min(1, ρ_i), a
+    step counts with
 
         A_i = -min(ρ̄, ρ_i) Â_i,    Â_i = Σ_l (γλ)^l c_{i+1}⋯c_{i+l} δ_{i+l},
 
     where δ takes the present V, and the critic's target is V(s_i) + c_i Â_i (V-trace; Espeholt et
-    al., IMPALA, ICML 2018, with ρ̄ = c̄ = 1 there). For π = π_then these are the weights of a
-    fresh rollout. That the states were visited by π_then is not corrected, as is usual (Queeney et
+    al., IMPALA, ICML 2018, with ρ̄ = c̄ = 1 there). For π = μ these are the cost advantages
+    of a fresh rollout. That μ visited the states is not corrected, as is usual (Queeney et
     al., Generalized proximal policy optimization with sample reuse, NeurIPS 2021). A rollout is
-    forgotten once its effective sample size (Σρ)²/Σρ² is less than half of its steps: with many
-    action components the policy soon leaves what it has seen.
+    dropped once its effective sample size (Σρ)²/Σρ² falls below half of its steps.
 
     Parameters
     ----------
@@ -65,7 +66,7 @@ class Replay:
         normalised by itself, as it was when it was fresh.
         """
         seen = [(batch, *_evaluate(policy, batch)) for batch in self._batches]
-        usable = [(batch, values, ratios) for batch, values, ratios in seen if _is_alike(ratios)]
+        usable = [entry for entry in seen if _is_alike(entry[0], entry[2])]
         self._batches = deque((batch for batch, _, _ in usable), self._batches.maxlen)
         return [
             self._reweight(batch, values, ratios, **weighting) for batch, values, ratios in usable
@@ -81,7 +82,7 @@ class Replay:
         normalize_advantage: bool,
         discount_visitation: bool,
     ) -> EpisodeBatch:
-        traces = np.minimum(ratios, 1.0)
+        clipped_ratios = np.minimum(ratios, 1.0)
         advantages = generalized_advantages(
             batch.rewards,
             values,
@@ -89,20 +90,21 @@ class Replay:
             batch.lengths,
             self._gamma,
             self._gae_lambda,
-            traces,
+            clipped_ratios,
         )
-        weights = cost_advantages(
+        costs = cost_advantages(
             advantages if baseline else advantages + values,
             batch.lengths,
+            batch.times,
             gamma=self._gamma,
             normalize_advantage=normalize_advantage,
             discount_visitation=discount_visitation,
         )
         return replace(
             batch,
-            cost_advantages=np.minimum(ratios, MAX_RATIO) * weights,
+            cost_advantages=np.minimum(ratios, MAX_RATIO) * costs,
             values=values,
-            returns=values + traces * advantages,
+            returns=values + clipped_ratios * advantages,
         )
 
 
@@ -110,17 +112,16 @@ def _evaluate(policy: ActorCriticPolicy, batch: EpisodeBatch) -> tuple[FloatArra
     """Return V(s_i) and ρ_i of the present policy, [T] each."""
     values, log_probs = [np.zeros(0)], [np.zeros(0)]
     for piece in batch.chunks(CHUNK):
-        with torch.no_grad():
-            value, log_prob, _ = policy.evaluate_actions(piece.observations, piece.actions)
-        values.append(value.flatten().cpu().double().numpy())
+        value, log_prob = values_and_log_probs(policy, piece.observations, piece.actions)
+        values.append(value.cpu().double().numpy())
         log_probs.append(log_prob.cpu().double().numpy())
     with np.errstate(over="ignore"):  # an infinite ratio ends the rollout's use
         return np.concatenate(values), np.exp(np.concatenate(log_probs) - batch.log_probs)
 
 
-def _is_alike(ratios: FloatArray) -> bool:
-    """Tell whether the rollout, over all ranks, still stands for enough of the present policy's."""
+def _is_alike(batch: EpisodeBatch, ratios: FloatArray) -> bool:
+    """Tell whether the effective sample size, over all ranks, is at least half of the steps."""
     with np.errstate(over="ignore"):
         sums = [len(ratios), ratios.sum(), (ratios**2).sum()]
-    size, total, squares = all_sum(torch.tensor(sums, dtype=torch.float64)).tolist()
+    size, total, squares = batch.total(torch.tensor(sums, dtype=torch.float64)).tolist()
     return bool(total**2 > MIN_EFFECTIVE_SIZE * size * squares)  # false where a sum is infinite

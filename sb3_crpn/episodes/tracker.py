@@ -1,19 +1,86 @@
-"""Fixed quotas of whole episodes per environment, so that no episode is kept for being short.
+"""Which steps of a rollout belong to which segment of which trajectory.
 
-Taking the first m episodes to finish over parallel environments favours short ones. Here each
-environment delivers its first q_e episodes, however long they take; q_e is fixed before the
-rollout starts. What an environment runs beyond its quota is thrown away.
+A *trajectory* runs from an environment's reset to its end. A *segment* is a piece of one that a
+rollout has seen. :class:`EpisodeTracker` keeps whole episodes alone, :class:`TimestepTracker` a
+fixed number of timesteps, in segments that go on in the next rollout.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import ClassVar, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
-from sb3_crpn.episodes.batch import IntArray
+from sb3_crpn.arrays import BoolArray, IntArray
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Consecutive steps of one trajectory in environment ``env``, ended by the current step.
+
+    Attributes
+    ----------
+    env, start, length
+        The environment, the rollout's row of the first step, and the number of steps.
+    cut
+        Whether the tracker ended it: the trajectory itself goes on.
+    time
+        The time of the first step in its trajectory.
+    trajectory
+        The trajectory's number among those of the environment.
+    """
+
+    env: int
+    start: int
+    length: int
+    cut: bool
+    time: int = 0
+    trajectory: int = 0
+
+
+@dataclass(frozen=True)
+class RolloutSize:
+    """How much a rollout is to collect: ``n_steps`` per environment, or ``n_episodes`` in all."""
+
+    n_steps: int
+    n_episodes: int
+    horizon: int | None = None
+
+
+class Tracker(Protocol):
+    """What decides when a rollout is complete, and which of its steps are learnt from.
+
+    Attributes
+    ----------
+    whole_episodes
+        Whether it keeps whole episodes alone. Environments are then reset before a rollout that
+        begins in mid-episode, and the number of episodes follows from their last mean length.
+    """
+
+    whole_episodes: ClassVar[bool]
+
+    def begin(self, size: RolloutSize, at_episode_start: BoolArray) -> None:
+        """Begin a rollout; ``at_episode_start``, [n_envs]: where the environments stand."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether the rollout has what it was to collect."""
+
+    @property
+    def needs_reset(self) -> bool:
+        """Whether nothing more will come until the environments are reset."""
+
+    @property
+    def recording(self) -> BoolArray:
+        """Whether the next step of each environment belongs to a segment, [n_envs]."""
+
+    def advance(self, dones: BoolArray) -> Iterator[Segment]:
+        """Take note of one step of every environment and yield the segments that it ended."""
+
+    def restart(self) -> None:
+        """Take note that all environments were reset."""
 
 
 def episodes_per_env(n_episodes: int, n_envs: int) -> IntArray:
@@ -26,50 +93,37 @@ def episodes_per_env(n_episodes: int, n_envs: int) -> IntArray:
 def steps_to_quota(n_steps: int, mean_episode_length: float | None) -> int:
     """Return the episodes per environment that should take about ``n_steps`` steps, at least 1.
 
-    ``mean_episode_length`` is that of earlier updates (``None``: there is none yet): a function of
-    the past alone, hence no bias.
+    ``mean_episode_length`` is that of the previous update (``None``: there is none yet): a
+    function of the past alone, hence no bias.
     """
     if mean_episode_length is None:
         return 1
     return max(1, round(n_steps / mean_episode_length))
 
 
-@dataclass(frozen=True)
-class EpisodeEnd:
-    """An episode of environment ``env`` that ended with the current step.
-
-    ``start`` is the rollout step of its first transition. ``cut`` says that the horizon ended it.
-    """
-
-    env: int
-    start: int
-    length: int
-    cut: bool
-
-
 class EpisodeTracker:
-    """Which steps of a rollout over parallel environments belong to which kept episode.
+    """Keeps a fixed quota of whole episodes from each environment, without length bias.
 
-    An environment is *recording* an episode, *waiting* for its next one to start (it is in the
-    middle of an episode that does not count), or has met its quota.
-
-    Parameters
-    ----------
-    quotas
-        Episodes to keep from each environment, [n_envs].
-    fresh
-        Whether each environment stands at an episode's first observation, [n_envs].
-    horizon
-        Steps after which an episode is cut; ``None``: never.
+    Taking the first m episodes to finish over parallel environments favours short ones. Here each
+    environment delivers its first q_e episodes, however long they take; q_e is fixed before the
+    rollout starts. What an environment runs beyond its quota is thrown away. An environment is
+    *recording* an episode, *waiting* for its next one to start (it is in the middle of an episode
+    that does not count), or has met its quota.
     """
 
-    def __init__(
-        self, quotas: IntArray, fresh: npt.NDArray[np.bool_], horizon: int | None = None
-    ) -> None:
-        self._remaining = quotas.copy()
-        self._horizon = np.inf if horizon is None else horizon
-        self._recording = fresh & (quotas > 0)
-        self._length = np.zeros(len(quotas), dtype=np.int64)
+    whole_episodes: ClassVar[bool] = True
+
+    def __init__(self) -> None:
+        self._n_ended = np.zeros(0, dtype=np.int64)
+
+    def begin(self, size: RolloutSize, at_episode_start: BoolArray) -> None:
+        """Begin a rollout of ``size.n_episodes``, each cut after ``size.horizon`` steps."""
+        if len(self._n_ended) != len(at_episode_start):
+            self._n_ended = np.zeros(len(at_episode_start), dtype=np.int64)
+        self._remaining = episodes_per_env(size.n_episodes, len(at_episode_start))
+        self._horizon = np.inf if size.horizon is None else size.horizon
+        self._recording = at_episode_start & (self._remaining > 0)
+        self._length = np.zeros(len(at_episode_start), dtype=np.int64)
         self._step = 0
 
     @property
@@ -83,19 +137,20 @@ class EpisodeTracker:
         return not self.complete and not self._recording.any()
 
     @property
-    def longest(self) -> int:
-        """Steps of the longest episode being recorded."""
-        return int(self._length.max())
+    def recording(self) -> BoolArray:
+        """Whether the next step of each environment belongs to a kept episode, [n_envs]."""
+        return self._recording
 
-    def advance(self, dones: npt.NDArray[np.bool_]) -> Iterator[EpisodeEnd]:
+    def advance(self, dones: BoolArray) -> Iterator[Segment]:
         """Take note of one step of every environment and yield the episodes that it ended."""
         self._step += 1
         self._length += self._recording
         ended = self._recording & (dones | (self._length >= self._horizon))
         for env in np.flatnonzero(ended):
-            length = int(self._length[env])
-            yield EpisodeEnd(int(env), self._step - length, length, cut=not dones[env])
+            length, number = int(self._length[env]), int(self._n_ended[env])
+            yield Segment(int(env), self._step - length, length, not dones[env], 0, number)
         self._length[ended] = 0
+        self._n_ended += ended
         self._remaining -= ended
         self._recording = (self._recording & ~ended | dones) & (self._remaining > 0)
 
@@ -103,3 +158,65 @@ class EpisodeTracker:
         """Take note that all environments were reset."""
         self._length[:] = 0
         self._recording = self._remaining > 0
+
+
+class TimestepTracker:
+    """Keeps ``n_steps`` steps of each environment, which goes on from where it stood.
+
+    It remembers the age and the number of each environment's trajectory from one rollout to the
+    next. ``horizon`` means nothing to it.
+    """
+
+    whole_episodes: ClassVar[bool] = False
+
+    def __init__(self) -> None:
+        self._age = self._number = np.zeros(0, dtype=np.int64)
+
+    def begin(self, size: RolloutSize, at_episode_start: BoolArray) -> None:
+        """Begin a rollout of ``size.n_steps`` steps of each environment."""
+        n_envs = len(at_episode_start)
+        if len(self._age) != n_envs:
+            self._age, self._number = np.zeros((2, n_envs), dtype=np.int64)
+        self._age = np.where(at_episode_start, 0, self._age)
+        self._number = self._number + at_episode_start
+        self._length = np.zeros(n_envs, dtype=np.int64)
+        self._n_steps, self._step = size.n_steps, 0
+
+    @property
+    def complete(self) -> bool:
+        """Whether all steps are there."""
+        return self._step >= self._n_steps
+
+    @property
+    def needs_reset(self) -> bool:
+        """Never: any state will do to go on from."""
+        return False
+
+    @property
+    def recording(self) -> BoolArray:
+        """Every step counts, [n_envs]."""
+        return np.ones(len(self._age), dtype=np.bool_)
+
+    def advance(self, dones: BoolArray) -> Iterator[Segment]:
+        """Take note of one step of every environment and yield the segments that it ended."""
+        self._step += 1
+        self._length += 1
+        ended = np.ones_like(dones) if self.complete else dones
+        for env in np.flatnonzero(ended):
+            length, age = int(self._length[env]), int(self._age[env])
+            cut, number = not dones[env], int(self._number[env])
+            yield Segment(int(env), self._step - length, length, cut, age, number)
+        self._age = np.where(dones, 0, self._age + self._length * ended)
+        self._number = self._number + dones
+        self._length[ended] = 0
+
+    def restart(self) -> None:
+        """Take note that all environments were reset."""
+        self._age[:] = self._length[:] = 0
+        self._number += 1
+
+
+TRACKERS: dict[str, Callable[[], Tracker]] = {
+    "episodes": EpisodeTracker,
+    "timesteps": TimestepTracker,
+}

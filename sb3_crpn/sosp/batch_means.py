@@ -9,14 +9,15 @@ import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import Tensor
 
-from sb3_crpn.curvature import PairWeights
+from sb3_crpn.arrays import Operator
+from sb3_crpn.curvature import Causal
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.parameters import ActorParameters
-from sb3_crpn.sosp.model_covariance import Operator, model_covariance
+from sb3_crpn.sosp.model_covariance import model_covariance
 
 # The causal estimator at κ = 1: unbiased (DESIGN section 2)
-UNBIASED = PairWeights("causal", 1.0)
+UNBIASED = Causal(1.0)
 
 # Up to this d every block's Hessian is written out: d products with each, fewer than the directions
 # and the limits would otherwise take

@@ -10,8 +10,8 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import sync_envs_normalization
 
-from sb3_crpn.algorithm.arguments import check_flag, check_integer
-from sb3_crpn.sosp.certificate import certify_sosp
+from sb3_crpn.checks import COUNT, FLAG, NONE, VERBOSE, integer
+from sb3_crpn.sosp.certificate import ENVIRONMENT, certify_sosp, checked_options
 from sb3_crpn.sosp.report import SospReport
 
 
@@ -40,6 +40,13 @@ class SospCallback(BaseCallback):
     **options
         Further arguments of :func:`certify_sosp`.
 
+    Raises
+    ------
+    ValueError
+        An argument is out of range.
+    TypeError
+        :func:`certify_sosp` has no such option.
+
     Attributes
     ----------
     report
@@ -59,15 +66,17 @@ class SospCallback(BaseCallback):
         verbose: int = 0,
         **options: Any,
     ) -> None:
-        super().__init__(verbose)
-        check_integer("eval_freq", eval_freq, 1)
-        check_flag("stop_at_sosp", stop_at_sosp)
-        self.eval_freq = eval_freq
+        name = type(self).__name__
+        super().__init__(VERBOSE(f"{name}: verbose", verbose))
+        self.eval_freq: int = COUNT(f"{name}: eval_freq", eval_freq)
         self.eval_env = eval_env
-        self.stop_at_sosp = stop_at_sosp
+        self.stop_at_sosp: bool = FLAG(f"{name}: stop_at_sosp", stop_at_sosp)
         self.report: SospReport | None = None
-        self._arguments = {"n_episodes": n_episodes, "epsilon": epsilon, "rho": rho, **options}
-        self._rng = np.random.default_rng(seed)
+        self._options = checked_options(
+            name, n_episodes=n_episodes, epsilon=epsilon, rho=rho, **options
+        )
+        ENVIRONMENT(f"{name}: eval_env", eval_env)
+        self._rng = np.random.default_rng((integer(0) | NONE)(f"{name}: seed", seed))
 
     def _init_callback(self) -> None:
         self._env = self.model._wrap_env(self.eval_env, monitor_wrapper=False)
@@ -79,7 +88,7 @@ class SospCallback(BaseCallback):
             sync_envs_normalization(self.training_env, self._env)
         assert isinstance(self.model, OnPolicyAlgorithm)
         self.report = certify_sosp(
-            self.model, env=self._env, seed=int(self._rng.integers(2**31)), **self._arguments
+            self.model, env=self._env, seed=int(self._rng.integers(2**31)), **self._options
         )
         self._log(self.report)
         return not (self.stop_at_sosp and self.report.verdict == "sosp")

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from functools import partial
-from typing import get_args
+from typing import Any, get_args
 
+import gymnasium as gym
 import numpy as np
 import torch
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -15,9 +15,21 @@ from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_crpn.algorithm import PolicyNewtonAlgorithm
-from sb3_crpn.algorithm.arguments import check_choice, check_integer, check_optional, check_real
+from sb3_crpn.checks import (
+    COUNT,
+    NONE,
+    POSITIVE,
+    Check,
+    choice,
+    integer,
+    not_allowed,
+    pair,
+    real,
+    requires,
+)
 from sb3_crpn.episodes.batch import EpisodeBatch, map_observations
 from sb3_crpn.parameters import ActorParameters
+from sb3_crpn.policy import find_actor
 from sb3_crpn.sosp.batch_means import BatchMeans
 from sb3_crpn.sosp.episodes import collect_episodes, preserve_state, with_baseline
 from sb3_crpn.sosp.inference import bernstein_intervals, bootstrap_intervals
@@ -27,6 +39,22 @@ from sb3_crpn.sosp.spectrum import lanczos_spectrum
 # Blocks that the noise is measured by: t_{49} is within 4 % of the normal quantile, and products
 # with 50 blocks cost about twice those with the whole batch at 500 steps a block
 MAX_BLOCKS = 50
+
+ENVIRONMENT = requires(
+    "an environment or a VecEnv", lambda value: isinstance(value, gym.Env | VecEnv)
+)
+
+_CHECKS: dict[str, Check] = {
+    "n_episodes": integer(4),
+    "epsilon": POSITIVE,
+    "rho": POSITIVE | NONE,
+    "confidence": real(0.0, 1.0, open_low=True, open_high=True),
+    "interval": choice(*get_args(IntervalMethod)),
+    "bounds": pair(POSITIVE) | NONE,
+    "n_eigenvalues": COUNT,
+    "n_probes": COUNT,
+    "seed": integer(0) | NONE,
+}
 
 
 def certify_sosp(
@@ -100,46 +128,69 @@ def certify_sosp(
     RuntimeError
         ``env=None`` in the middle of a rollout.
     """
-    _check_arguments(n_episodes, epsilon, rho, confidence, interval, bounds)
-    check_integer("n_eigenvalues", n_eigenvalues, 1)
-    check_integer("n_probes", n_probes, 1)
+    checked = checked_options(
+        "certify_sosp",
+        n_episodes=n_episodes,
+        epsilon=epsilon,
+        rho=rho,
+        confidence=confidence,
+        interval=interval,
+        bounds=bounds,
+        n_eigenvalues=n_eigenvalues,
+        n_probes=n_probes,
+        seed=seed,
+    )
+    confidence, interval, bounds = (checked[k] for k in ("confidence", "interval", "bounds"))
+    lanczos = {"n_probes": checked["n_probes"], "n_leftmost": checked["n_eigenvalues"]}
     policy, target = _policy(model), _environment(model, env)
-    rng = np.random.default_rng(seed)
-    n_blocks, n_episodes = _blocks(n_episodes)
+    rng = np.random.default_rng(checked["seed"])
+    n_blocks, n_episodes = _blocks(checked["n_episodes"])
     with preserve_state(policy, target, int(rng.integers(2**31))):
-        horizon = getattr(model, "horizon", None)
-        batch = collect_episodes(policy, target, n_episodes, gamma=model.gamma, horizon=horizon)
-        if interval == "bootstrap":
-            batch = with_baseline(policy, batch, model.gamma)
-        sample = BatchMeans.from_episodes(
-            policy, _actor(policy, batch), batch, n_blocks, model.gamma, rng
-        )
+        batch = _simulate(model, policy, target, n_episodes, baseline=interval == "bootstrap")
+        actor = _actor(policy, batch)
+        sample = BatchMeans.from_episodes(policy, actor, batch, n_blocks, model.gamma, rng)
         generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
-        spectrum = lanczos_spectrum(
-            sample.mean_product,
-            sample.gradients[0],
-            generator,
-            n_probes=n_probes,
-            n_leftmost=n_eigenvalues,
-        )
-        if interval == "bootstrap":
+        spectrum = lanczos_spectrum(sample.mean_product, sample.gradients[0], generator, **lanczos)
+        if bounds is None:
             intervals = bootstrap_intervals(sample, spectrum, confidence, generator, rng)
-        else:
-            assert bounds is not None  # by _check_arguments
+        else:  # of "bernstein", by checked_options
             intervals = bernstein_intervals(sample, spectrum, confidence, bounds, n_episodes)
-    gradient, direction = sample.gradients.mean(0), spectrum.vector
+    gradient = sample.gradients.mean(0)
     return SospReport(
         *intervals,
-        epsilon=float(epsilon),
-        rho=_default_rho(model) if rho is None else float(rho),
+        epsilon=checked["epsilon"],
+        rho=_default_rho(model) if checked["rho"] is None else checked["rho"],
         confidence=confidence,
         interval=interval,
         n_episodes=n_episodes,
         n_steps=batch.n_steps,
         gradient=gradient,
-        escape_direction=-direction if gradient @ direction > 0.0 else direction,
+        escape_direction=_downhill(gradient, spectrum.vector),
         spectrum=spectrum,
     )
+
+
+def _simulate(
+    model: OnPolicyAlgorithm,
+    policy: ActorCriticPolicy,
+    env: VecEnv,
+    n_episodes: int,
+    *,
+    baseline: bool,
+) -> EpisodeBatch:
+    """Return episodes end to end, their costs-to-go less the model's critic if ``baseline``."""
+    horizon = getattr(model, "horizon", None)
+    batch = collect_episodes(policy, env, n_episodes, gamma=model.gamma, horizon=horizon)
+    return with_baseline(policy, batch, model.gamma) if baseline else batch
+
+
+def _actor(policy: ActorCriticPolicy, batch: EpisodeBatch) -> ActorParameters:
+    first = map_observations(batch.observations, lambda tensor: tensor[:1])
+    return find_actor(policy, first)
+
+
+def _downhill(gradient: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
+    return -direction if gradient @ direction > 0.0 else direction
 
 
 def _blocks(n_episodes: int) -> tuple[int, int]:
@@ -153,8 +204,8 @@ def _policy(model: OnPolicyAlgorithm) -> ActorCriticPolicy:
     policy = getattr(model, "policy", None)
     if not isinstance(policy, ActorCriticPolicy) or hasattr(policy, "lstm_actor"):
         raise ValueError(
-            f"model={model!r} has a policy of type {type(policy).__name__}, "
-            "must be an on-policy model with a feed-forward ActorCriticPolicy"
+            f"certify_sosp: model={model!r} is not allowed, must be an on-policy model with a "
+            f"feed-forward ActorCriticPolicy, not {type(policy).__name__}"
         )
     return policy
 
@@ -162,12 +213,13 @@ def _policy(model: OnPolicyAlgorithm) -> ActorCriticPolicy:
 def _environment(model: OnPolicyAlgorithm, env: GymEnv | None) -> VecEnv:
     """Return the environment to simulate in, wrapped as SB3 does."""
     if env is not None:
+        ENVIRONMENT("certify_sosp: env", env)
         env = model._wrap_env(env, monitor_wrapper=False)
         check_for_correct_spaces(env, model.observation_space, model.action_space)
         return env
     own = model.get_env()
     if own is None:
-        raise ValueError("env=None is not allowed for a model without an environment")
+        raise not_allowed("certify_sosp: env", None, "given: the model has no environment")
     if _in_rollout(model):
         raise RuntimeError(
             "the model's environment is in the middle of a rollout: "
@@ -188,13 +240,6 @@ def _in_rollout(model: OnPolicyAlgorithm) -> bool:
     return started and not model.rollout_buffer.full
 
 
-def _actor(policy: ActorCriticPolicy, batch: EpisodeBatch) -> ActorParameters:
-    """Select the parameters that log π depends on, by gradient reachability."""
-    first = map_observations(batch.observations, lambda tensor: tensor[:1])
-    log_prob = policy.get_distribution(first).log_prob(batch.actions[:1])
-    return ActorParameters.reachable(policy, log_prob)
-
-
 def _default_rho(model: OnPolicyAlgorithm) -> float:
     if not isinstance(model, PolicyNewtonAlgorithm):
         return 1.0
@@ -203,23 +248,27 @@ def _default_rho(model: OnPolicyAlgorithm) -> float:
     return model.alpha_schedule(model._current_progress_remaining)
 
 
-def _check_arguments(
-    n_episodes: int,
-    epsilon: float,
-    rho: float | None,
-    confidence: float,
-    interval: str,
-    bounds: tuple[float, float] | None,
-) -> None:
-    positive = partial(check_real, low=0.0, open_low=True)
-    check_integer("n_episodes", n_episodes, 4)
-    positive("epsilon", epsilon)
-    check_optional("rho", rho, positive)
-    check_real("confidence", confidence, 0.0, 1.0)
-    if confidence in (0.0, 1.0):
-        raise ValueError(f"confidence={confidence!r} is not allowed, must be in (0, 1)")
-    check_choice("interval", interval, get_args(IntervalMethod))
+def checked_options(owner: str, **options: Any) -> dict[str, Any]:
+    """Return what :func:`certify_sosp` is told but the model and its environment, checked.
+
+    Parameters
+    ----------
+    owner
+        The class or function that the user called, for messages.
+
+    Raises
+    ------
+    TypeError
+        An option does not exist.
+    ValueError
+        One is out of range.
+    """
+    for name, value in options.items():
+        if name not in _CHECKS:
+            raise TypeError(f"{owner} has no argument {name}")
+        options[name] = _CHECKS[name](f"{owner}: {name}", value)
+    bounds, interval = options.get("bounds"), options.get("interval", "bootstrap")
     if (bounds is None) != (interval == "bootstrap"):
-        raise ValueError(f'bounds={bounds!r} is not allowed: "bernstein" needs them, alone')
-    for bound in bounds or ():
-        positive("bounds", bound)
+        allowed = 'two numbers with interval="bernstein", None with "bootstrap"'
+        raise not_allowed(f"{owner}: bounds", bounds, allowed)
+    return options

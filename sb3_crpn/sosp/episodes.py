@@ -5,24 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
 
-import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_crpn.algorithm.collection import ENDLESS, Array
 from sb3_crpn.episodes import (
+    Collector,
     DictEpisodeRolloutBuffer,
     EpisodeBatch,
     EpisodeRolloutBuffer,
     EpisodeTracker,
-    episodes_per_env,
+    RolloutSize,
 )
 from sb3_crpn.episodes.batch import episode_time
+from sb3_crpn.policy import state_values
 
 
 @contextmanager
@@ -84,34 +82,14 @@ def collect_episodes(
     ValueError
         A reward is not finite, or no episode comes to an end.
     """
-    buffer = _new_buffer(policy, env.num_envs, gamma)
-    obs, starts = env.reset(), np.ones(env.num_envs, dtype=bool)
-    tracker = EpisodeTracker(episodes_per_env(n_episodes, env.num_envs), starts, horizon)
-    unused = torch.zeros(env.num_envs)
-    last_end = 0
-    while not tracker.complete:
-        actions = _sample(policy, obs, env.num_envs)
-        new_obs, rewards, dones, _ = env.step(_for_environment(policy, actions))
-        buffer.add(obs, actions, rewards, starts, unused, unused)
-        for end in tracker.advance(dones):
-            buffer.close_episode(end, terminal_value=0.0)
-            last_end = buffer.pos
-        obs, starts = new_obs, dones
-        if tracker.needs_reset:
-            obs, starts = env.reset(), np.ones(env.num_envs, dtype=bool)
-            tracker.restart()
-        if buffer.pos - last_end >= ENDLESS:
-            raise ValueError(
-                f"no episode ended within {ENDLESS} steps, but the estimates need whole episodes: "
-                "wrap the environment in gymnasium.wrappers.TimeLimit"
-            )
-    buffer.compute_advantages()
-    batch = buffer.episode_batch(
-        baseline=False, normalize_advantage=False, discount_visitation=True
+    collector = Collector(
+        policy, env, bootstrap_truncated=False, uses_critic=False, sde_sample_freq=1
     )
-    if not np.isfinite(batch.cost_advantages).all():
-        raise ValueError("the environment returned a non-finite reward; VecCheckNan finds it")
-    return batch
+    collector.reset()
+    buffer = _new_buffer(policy, env.num_envs, gamma)
+    size = RolloutSize(n_steps=0, n_episodes=n_episodes, horizon=horizon)
+    collector.collect(buffer, EpisodeTracker(), size)
+    return buffer.episode_batch(baseline=False, normalize_advantage=False, discount_visitation=True)
 
 
 def with_baseline(policy: ActorCriticPolicy, batch: EpisodeBatch, gamma: float) -> EpisodeBatch:
@@ -121,10 +99,9 @@ def with_baseline(policy: ActorCriticPolicy, batch: EpisodeBatch, gamma: float) 
     episodes than these (DESIGN section 2).
     """
     with torch.no_grad():
-        values = policy.predict_values(batch.observations).flatten().cpu().double().numpy()
-    return replace(
-        batch, cost_advantages=batch.cost_advantages + gamma ** episode_time(batch.lengths) * values
-    )
+        values = state_values(policy, batch.observations).cpu().double().numpy()
+    baseline = gamma ** episode_time(batch.lengths) * values
+    return replace(batch, cost_advantages=batch.cost_advantages + baseline)
 
 
 def _new_buffer(policy: ActorCriticPolicy, n_envs: int, gamma: float) -> EpisodeRolloutBuffer:
@@ -141,24 +118,3 @@ def _new_buffer(policy: ActorCriticPolicy, n_envs: int, gamma: float) -> Episode
         gae_lambda=1.0,
         n_envs=n_envs,
     )
-
-
-def _sample(policy: ActorCriticPolicy, obs: Any, n_envs: int) -> Array:
-    with torch.no_grad():
-        if policy.use_sde:
-            policy.reset_noise(n_envs)
-        distribution = policy.get_distribution(obs_as_tensor(obs, policy.device))
-        actions: Array = distribution.get_actions().cpu().numpy()
-    return actions
-
-
-def _for_environment(policy: ActorCriticPolicy, actions: Array) -> Array:
-    """Return the actions as the environment takes them, as SB3's ``predict`` does."""
-    space = policy.action_space
-    if not isinstance(space, spaces.Box):
-        return actions
-    actions = actions.reshape(-1, *space.shape)
-    if policy.squash_output:
-        return policy.unscale_action(actions)
-    clipped: Array = np.clip(actions, space.low, space.high)
-    return clipped

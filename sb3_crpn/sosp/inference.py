@@ -35,9 +35,10 @@ import numpy as np
 import torch
 from scipy.stats import t as student
 
+from sb3_crpn.arrays import FloatArray
 from sb3_crpn.sosp.batch_means import BatchMeans
 from sb3_crpn.sosp.robust import worst_curvature
-from sb3_crpn.sosp.spectrum import FloatArray, Spectrum, lanczos_spectrum
+from sb3_crpn.sosp.spectrum import Spectrum, lanczos_spectrum
 
 N_RESAMPLES = 10_000
 

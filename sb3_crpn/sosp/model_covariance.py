@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,11 +12,10 @@ from torch import Tensor
 from torch.distributions import Bernoulli, Categorical
 from torch.nn.functional import logsigmoid
 
+from sb3_crpn.arrays import Operator
 from sb3_crpn.curvature.derivatives import policy_distribution
 from sb3_crpn.episodes.batch import EpisodeBatch, episode_time
 from sb3_crpn.parameters import ActorParameters
-
-Operator = Callable[[Tensor], Tensor]
 
 # Actions expected so many times in all the episodes, and no more, may be missing from them: a
 # Poisson variable of mean 5 is zero with probability 0.7 %

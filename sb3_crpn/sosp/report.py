@@ -84,7 +84,7 @@ class SospReport:
         leftmost = ", ".join(f"{value:.3g}" for value in self.spectrum.leftmost)
         return "\n".join(
             [
-                f"{self.verdict}: ε = {self.epsilon:g}, ρ = {self.rho:g}, "  # noqa: RUF001
+                f"{self.verdict}: ε = {self.epsilon:g}, ρ = {self.rho:g}, "
                 f"{self.confidence:.0%} confidence ({self.interval})",
                 f"  ‖∇J‖        {self.gradient_norm}, stationary: ≤ {self.epsilon:.3g}",
                 f"  λ_min(∇²J)  {self.lambda_min}, "

@@ -9,8 +9,8 @@ import torch
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
+from sb3_crpn.arrays import FloatArray
 from sb3_crpn.sosp.batch_means import BatchMeans
-from sb3_crpn.sosp.spectrum import FloatArray
 
 # Krylov steps on V̂, all directions tried, and the part of the interval's width that the last
 # residual may take

@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from sb3_crpn.arrays import FloatArray, Operator
 from sb3_crpn.cubic import krylov_basis
-from sb3_crpn.sosp.model_covariance import Operator
-
-FloatArray = npt.NDArray[np.float64]
 
 # Products of one Lanczos run. On CartPole-v1, 64×64, the leftmost Ritz pair of an untrained and of
 # two trained policies had a residual below 1e-6 of the spectrum's width after 20
@@ -103,20 +100,12 @@ def lanczos_spectrum(
 
 
 def _run(operator: Operator, like: Tensor, generator: torch.Generator, n_steps: int) -> Spectrum:
-    products: list[Tensor] = []
-
-    def recorded(vector: Tensor) -> Tensor:
-        products.append(operator(vector))
-        return products[-1]
-
     if like.numel() <= n_steps:
         basis = torch.eye(like.numel(), dtype=like.dtype, device=like.device)
-        for column in basis:
-            recorded(column)
+        images = torch.stack([operator(column) for column in basis], dim=1)
     else:
         start = torch.randn(like.numel(), generator=generator, dtype=like.dtype).to(like.device)
-        basis = krylov_basis(recorded, start, n_steps)
-    images = torch.stack(products, dim=1)  # A·basis
+        basis, images = krylov_basis(operator, start, n_steps)
     projected = basis.T @ images
     values, rotation = torch.linalg.eigh(0.5 * (projected + projected.T))
     # the first basis vector is the start; all of ℝᵈ gives each eigenvalue its 1/d

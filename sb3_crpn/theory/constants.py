@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from sb3_crpn.theory.checks import require_count, require_positive, require_real
+from sb3_crpn.checks import COUNT, FRACTION, POSITIVE, requires
 from sb3_crpn.theory.policies import ScoreBounds
+
+_SCORES = requires("a ScoreBounds", lambda value: isinstance(value, ScoreBounds))
 
 
 @dataclass(frozen=True)
@@ -59,10 +61,9 @@ class Constants:
     gamma: float = 1.0
 
     def __post_init__(self) -> None:
-        require_positive("K", self.K)
-        require_count("H", self.H)
-        require_count("d", self.d)
-        require_real("gamma", self.gamma, 0.0, 1.0)
+        checks = {"K": POSITIVE, "scores": _SCORES, "H": COUNT, "d": COUNT, "gamma": FRACTION}
+        for name, check in checks.items():
+            object.__setattr__(self, name, check(f"Constants: {name}", getattr(self, name)))
 
     def _moment(self, power: float) -> float:
         """S_p = Σ_{h<H} γ^h (h + 1)^p."""
@@ -115,7 +116,7 @@ class Constants:
 
     def gradient_error(self, n_episodes: int) -> float:
         """Bound (E‖g - ∇J‖²)^½ of the mean of m episodes: G_g/√m."""
-        require_count("n_episodes", n_episodes)
+        n_episodes = COUNT("gradient_error: n_episodes", n_episodes)
         return self.G_g / math.sqrt(n_episodes)
 
     def hessian_error(self, n_episodes: int) -> float:
@@ -126,5 +127,5 @@ class Constants:
         t_0² = 2s² log 2d =: us² on, E‖H - ∇²J‖³ ≤ s³(u^{3/2} + 3u^{1/2} + 3u^{-1/2}) ≤
         s³(u + 3)^{3/2}.
         """
-        require_count("n_episodes", n_episodes)
+        n_episodes = COUNT("hessian_error: n_episodes", n_episodes)
         return self.M_2 * math.sqrt((3.0 + 2.0 * math.log(2.0 * self.d)) / n_episodes)

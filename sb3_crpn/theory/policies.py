@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from sb3_crpn.theory.checks import require_count, require_positive, require_real
+from sb3_crpn.checks import COUNT, FLAG, POSITIVE, real
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class ScoreBounds:
     L_2: float
 
     def __post_init__(self) -> None:
-        require_positive("G", self.G)
-        require_real("L_1", self.L_1, 0.0)
-        require_real("L_2", self.L_2, 0.0)
+        for name, check in (("G", POSITIVE), ("L_1", real(0.0)), ("L_2", real(0.0))):
+            value = check(f"ScoreBounds: {name}", getattr(self, name))
+            object.__setattr__(self, name, value)
 
 
 def softmax_linear(feature_norm: float, *, bias: bool = True) -> ScoreBounds:
@@ -56,7 +56,7 @@ def softmax_linear(feature_norm: float, *, bias: bool = True) -> ScoreBounds:
     bias
         Whether b is a parameter too, as in SB3.
     """
-    norm = _norm(feature_norm, bias)
+    norm = _norm("softmax_linear", feature_norm, bias)
     return ScoreBounds(
         G=math.sqrt(2.0) * norm, L_1=norm**2 / 2.0, L_2=math.sqrt(6.0) / 9.0 * norm**3
     )
@@ -103,17 +103,19 @@ def gaussian_linear(
     bias
         Whether b is a parameter too, as in SB3.
     """
-    norm = _norm(feature_norm, bias)
-    require_positive("std", std)
-    require_count("action_dim", action_dim)
-    require_count("n_actions", n_actions)
-    require_positive("failure_probability", failure_probability, 1.0)
+    norm = _norm("gaussian_linear", feature_norm, bias)
+    std = POSITIVE("gaussian_linear: std", std)
+    action_dim = COUNT("gaussian_linear: action_dim", action_dim)
+    n_actions = COUNT("gaussian_linear: n_actions", n_actions)
+    failure_probability = real(0.0, 1.0, open_low=True)(
+        "gaussian_linear: failure_probability", failure_probability
+    )
     x = math.log(n_actions / failure_probability)
     noise = math.sqrt(action_dim + 2.0 * math.sqrt(action_dim * x) + 2.0 * x)
     return ScoreBounds(G=noise * norm / std, L_1=(norm / std) ** 2, L_2=0.0)
 
 
-def _norm(feature_norm: float, bias: bool) -> float:
+def _norm(function: str, feature_norm: float, bias: bool) -> float:
     """Return the norm of the features, with the constant feature of a bias."""
-    require_positive("feature_norm", feature_norm)
-    return math.hypot(feature_norm, 1.0) if bias else feature_norm
+    norm: float = POSITIVE(f"{function}: feature_norm", feature_norm)
+    return math.hypot(norm, 1.0) if FLAG(f"{function}: bias", bias) else norm

@@ -29,7 +29,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from sb3_crpn.theory.checks import require_count, require_positive
+from sb3_crpn.checks import COUNT, POSITIVE, real, requires
 from sb3_crpn.theory.constants import Constants
 
 
@@ -52,6 +52,9 @@ _LEAST_CONDITION = 150.0
 _STEP_DIVISOR = 20.0
 # κ, the negative curvature, as a part of √(ρε), that the descent must make out
 _VISIBLE_CURVATURE = 0.25
+
+_CONSTANTS = requires("a Constants", lambda value: isinstance(value, Constants))
+_PROBABILITY = real(0.0, 1.0, open_low=True, open_high=True)
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,7 @@ class Recipe:
 
         All episodes are taken to last H steps; shorter ones make more updates, which does no harm.
         """
-        require_count("n_envs", n_envs)
+        n_envs = COUNT("total_timesteps: n_envs", n_envs)
         rounds = -(-self.episodes_per_update // n_envs)
         return int(self.n_updates * rounds * n_envs * self.kwargs["horizon"])
 
@@ -119,7 +122,7 @@ def expectation_recipe(
     ValueError
         ``epsilon`` or ``initial_gap`` is out of range.
     """
-    n_updates = _n_updates(constants, epsilon, initial_gap, _EXACT)
+    epsilon, n_updates = _checked("expectation_recipe", constants, epsilon, initial_gap, _EXACT)
     gradient_error, hessian_error = _allowed_errors(constants, epsilon, _EXACT)
     m = math.ceil((constants.gradient_error(1) / gradient_error) ** 2)
     b = math.ceil((constants.hessian_error(1) / hessian_error) ** 2)
@@ -154,7 +157,12 @@ def high_probability_recipe(
     ValueError
         An argument is out of range.
     """
-    n_updates = _n_updates(constants, epsilon, initial_gap, _EXACT)
+    epsilon, n_updates = _checked(
+        "high_probability_recipe", constants, epsilon, initial_gap, _EXACT
+    )
+    failure_probability = _PROBABILITY(
+        "high_probability_recipe: failure_probability", failure_probability
+    )
     m, b = _bernstein(constants, epsilon, failure_probability, n_updates, _EXACT)
     kwargs = {**_batches(constants, m, b), "alpha": 3.0 * constants.L_H}
     longest = _LONGEST_SOSP_STEP * math.sqrt(epsilon / constants.L_H)
@@ -200,7 +208,12 @@ def approximate_recipe(
     ValueError
         An argument is out of range.
     """
-    n_updates = _n_updates(constants, epsilon, initial_gap, _APPROXIMATE)
+    epsilon, n_updates = _checked(
+        "approximate_recipe", constants, epsilon, initial_gap, _APPROXIMATE
+    )
+    failure_probability = _PROBABILITY(
+        "approximate_recipe: failure_probability", failure_probability
+    )
     m, b = _bernstein(constants, epsilon, failure_probability, n_updates, _APPROXIMATE)
     curvature = math.sqrt(constants.L_H * epsilon)
     # ℓ ≥ ‖H‖: at most M_H + c_2√(ρε)
@@ -228,14 +241,18 @@ def _batches(constants: Constants, m: int, b: int) -> dict[str, Any]:
     }
 
 
-def _n_updates(constants: Constants, epsilon: float, initial_gap: float | None, plan: _Plan) -> int:
-    """Return the least N whose gains exceed J(θ_0) - J*."""
-    require_positive("epsilon", epsilon, constants.M_H**2 / constants.L_H)
+def _checked(
+    function: str, constants: Constants, epsilon: float, initial_gap: float | None, plan: _Plan
+) -> tuple[float, int]:
+    """Return ε and the least N whose gains exceed J(θ_0) - J*, for good arguments."""
+    constants = _CONSTANTS(f"{function}: constants", constants)
+    largest = constants.M_H**2 / constants.L_H
+    epsilon = real(0.0, largest, open_low=True)(f"{function}: epsilon", epsilon)
     if initial_gap is None:
         initial_gap = 2.0 * constants.cost_bound
-    require_positive("initial_gap", initial_gap)
+    initial_gap = POSITIVE(f"{function}: initial_gap", initial_gap)
     gain = plan.gain * epsilon * math.sqrt(epsilon / constants.L_H)
-    return math.floor(initial_gap / gain) + 1
+    return epsilon, math.floor(initial_gap / gain) + 1
 
 
 def _allowed_errors(constants: Constants, epsilon: float, plan: _Plan) -> tuple[float, float]:
@@ -248,10 +265,6 @@ def _bernstein(
     constants: Constants, epsilon: float, failure_probability: float, n_updates: int, plan: _Plan
 ) -> tuple[int, int]:
     """Return m and b that keep the errors small enough in all updates; see the caller."""
-    if not 0.0 < failure_probability < 1.0:
-        raise ValueError(
-            f"failure_probability={failure_probability!r} is not allowed, must be in (0, 1)"
-        )
     logarithm = math.log(4.0 * constants.d * n_updates / failure_probability)
 
     def batch(largest: float, deviation: float, error: float) -> int:

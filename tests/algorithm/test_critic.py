@@ -139,9 +139,9 @@ def test_the_update_fits_the_critic_around_a_shared_extractor(monkeypatch):
     shared = model.policy.features_extractor.linear.weight
     assert any(tensor is shared for tensor in model.actor.tensors)
     states = []
-    take, fit_values = model._take_step, model._fit_critic
+    take, fit_values = update.take_step, model._fit_critic
     monkeypatch.setattr(
-        model, "_take_step", lambda *a: (take(*a), states.append(model.actor.vector))[0]
+        update, "take_step", lambda *a: (take(*a), states.append(model.actor.vector))[0]
     )
     monkeypatch.setattr(
         model, "_fit_critic", lambda *a: (states.append("critic"), fit_values(*a))[1]

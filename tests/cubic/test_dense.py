@@ -149,14 +149,17 @@ def test_rounding_is_reported_not_hidden():
 
 
 BAD = [
-    (dict(gradient=[]), r"gradient has shape \(0,\); \(d,\) with d ≥ 1"),
+    (dict(gradient=[]), r"gradient has shape \(0,\), must be \(d,\) with d >= 1"),
     (dict(gradient=[[1.0]]), r"gradient has shape \(1, 1\)"),
     (dict(gradient=[np.nan, 0.0]), "gradient has 1 NaN or infinite entries"),
-    (dict(hessian=np.eye(3)), r"hessian has shape \(3, 3\); \(2, 2\) is required"),
+    (dict(hessian=np.eye(3)), r"hessian has shape \(3, 3\), must be \(2, 2\)"),
     (dict(hessian=np.full((2, 2), np.inf)), "hessian has 4 NaN or infinite entries"),
-    (dict(alpha=0.0), r"alpha is 0.0; a finite number > 0"),
-    (dict(alpha=np.inf), "alpha is inf"),
-    (dict(alpha=np.nan), "alpha is nan"),
+    (
+        dict(alpha=0.0),
+        r"solve_dense: alpha=0.0 is not allowed, must be a finite number in \(0, inf\)",
+    ),
+    (dict(alpha=np.inf), "alpha=inf"),
+    (dict(alpha=np.nan), "alpha=nan"),
     (dict(metric=np.eye(3)), "metric has shape"),
     (dict(metric=-np.eye(2)), "metric is not positive definite"),
     (dict(metric=np.diag([1.0, 0.0])), "metric is not positive definite"),

@@ -149,12 +149,12 @@ def test_the_seed_decides_and_the_global_generator_is_untouched():
     ("change", "message"),
     [
         (dict(gradient=np.array([1.0, np.inf])), "gradient has 1 NaN"),
-        (dict(alpha=-1.0), r"alpha is -1.0"),
-        (dict(tol=0.0), "tol is 0.0"),
-        (dict(max_products=1), "max_products is 1; an integer ≥ 2"),
-        (dict(max_products=2.5), "max_products is 2.5"),
+        (dict(alpha=-1.0), "solve_krylov: alpha=-1.0"),
+        (dict(tol=0.0), "tol=0.0"),
+        (dict(max_products=1), "max_products=1 is not allowed, must be an integer >= 2"),
+        (dict(max_products=2.5), "max_products=2.5"),
         (dict(hvp=lambda v: v[:1]), r"hvp returned shape \(1,\)"),
-        (dict(hvp=lambda v: v * np.nan), "the product of hvp has 2 NaN"),
+        (dict(hvp=lambda v: v * np.nan), "the product of solve_krylov: hvp has 2 NaN"),
     ],
 )
 def test_bad_input(change, message):
@@ -171,7 +171,8 @@ def test_bad_input(change, message):
 def test_basis_is_orthonormal_and_spans_the_krylov_space(dim, spectrum):
     problem = large(eigenvalues=SPECTRA.get(spectrum))
     hvp = problem.hvp()
-    Q = krylov_basis(hvp, problem.gradient, dim)
+    Q, AQ = krylov_basis(hvp, problem.gradient, dim)
+    torch.testing.assert_close(AQ, hvp.hessian @ Q)
     k = Q.shape[1]
     assert Q.shape == (problem.dim, k)
     assert k <= dim
@@ -186,14 +187,19 @@ def test_basis_is_orthonormal_and_spans_the_krylov_space(dim, spectrum):
 
 def test_basis_stops_at_breakdown():
     problem = large(eigenvalues=SPECTRA["clusters"])
-    assert krylov_basis(problem.hvp(), problem.gradient, 50).shape == (300, 3)
-    assert krylov_basis(lambda v: 0 * v, np.ones(5), 3).shape == (5, 1)
-    assert krylov_basis(lambda v: v, np.ones(1), 3).shape == (1, 1)
-    assert krylov_basis(lambda v: v, np.zeros(4), 3).shape == (4, 0)
+    for operator, start, dim, shape in [
+        (problem.hvp(), problem.gradient, 50, (300, 3)),
+        (lambda v: 0 * v, np.ones(5), 3, (5, 1)),
+        (lambda v: v, np.ones(1), 3, (1, 1)),
+        (lambda v: v, np.ones(2), 10**15, (2, 1)),  # ends at once
+        (lambda v: v, np.zeros(4), 3, (4, 0)),
+    ]:
+        Q, AQ = krylov_basis(operator, start, dim)
+        assert Q.shape == AQ.shape == shape
 
 
 def test_basis_checks_its_input():
-    with pytest.raises(ValueError, match="dim is 0"):
+    with pytest.raises(ValueError, match="krylov_basis: dim=0"):
         krylov_basis(lambda v: v, np.ones(3), 0)
     with pytest.raises(ValueError, match="start has 1 NaN"):
         krylov_basis(lambda v: v, [np.nan, 1.0], 2)

@@ -1,68 +1,35 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from stable_baselines3.common.distributions import kl_divergence
 
-from sb3_crpn.curvature.derivatives import EpisodeDerivatives, PairWeights, policy_distribution
+from sb3_crpn.curvature.derivatives import EpisodeDerivatives, policy_distribution
 from tests.policies import (
     ACTION_SPACES,
+    ESTIMATORS,
     central_jacobian,
     dense_hessian,
     episode_slices,
+    estimator_of,
     flat_gradient,
     frozen_episodes,
     log_probabilities,
-    pair_matrix,
     scores,
     small_policy,
 )
 
-ESTIMATORS = [("trajectory", 1.0), *(("causal", decay) for decay in (0.0, 0.5, 0.9, 1.0))]
 KINDS = ["discrete", "gaussian"]
 
 
 def group_of(kind, estimator="causal", decay=0.9, **options):
     policy, actor = small_policy(kind, **options)
     batch = frozen_episodes(small_policy(kind)[0])
-    group = EpisodeDerivatives(policy, actor, batch, PairWeights(estimator, decay))
+    group = EpisodeDerivatives(policy, actor, batch, estimator_of(estimator, decay))
     return policy, actor, batch, group
 
 
 def columns(product, size):
     return torch.stack([product(e) for e in torch.eye(size, dtype=torch.float64)], dim=1)
-
-
-@given(
-    lengths=st.lists(st.integers(1, 6), min_size=1, max_size=5),
-    case=st.sampled_from(ESTIMATORS),
-    seed=st.integers(0, 1000),
-)
-@settings(deadline=None, max_examples=60)
-def test_pair_weights_are_the_explicit_matrix(lengths, case, seed):
-    rng = np.random.default_rng(seed)
-    weights, u = rng.normal(size=(2, sum(lengths)))
-    pieces = np.cumsum(lengths)[:-1]
-    expected = [
-        pair_matrix(*case, A) @ x
-        for A, x in zip(np.split(weights, pieces), np.split(u, pieces), strict=True)
-    ]
-    np.testing.assert_allclose(
-        PairWeights(*case).apply(weights, np.array(lengths), u),
-        np.concatenate(expected),
-        atol=1e-12,
-    )
-
-
-@pytest.mark.parametrize("case", ESTIMATORS)
-def test_pair_weights_take_several_vectors_at_once(case):
-    lengths = np.array([3, 1, 4])
-    weights, *u = np.random.default_rng(0).normal(size=(4, 8))
-    W = PairWeights(*case)
-    expected = np.stack([W.apply(weights, lengths, column) for column in u], axis=1)
-    applied = W.apply(weights, lengths, np.stack(u, axis=1))
-    np.testing.assert_allclose(applied, expected, rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize("kind", ACTION_SPACES)

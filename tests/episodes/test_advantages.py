@@ -68,11 +68,21 @@ def test_weights_are_costs_normalised_and_discounted_on_request():
     lengths = np.array([2, 3])
     advantages = np.array([1.0, -2.0, 0.5, 4.0, -1.0])
     options = {"gamma": 0.5, "normalize_advantage": False, "discount_visitation": False}
-    original = advantages.copy()
-    np.testing.assert_array_equal(cost_advantages(advantages, lengths, **options), -advantages)
-    discounted = cost_advantages(advantages, lengths, **options | {"discount_visitation": True})
+    original, times = advantages.copy(), np.zeros(2, int)
+    np.testing.assert_array_equal(
+        cost_advantages(advantages, lengths, times, **options), -advantages
+    )
+    discounted = cost_advantages(
+        advantages, lengths, times, **options | {"discount_visitation": True}
+    )
     np.testing.assert_array_equal(discounted, -advantages * [1, 0.5, 1, 0.5, 0.25])
-    normalised = cost_advantages(advantages, lengths, **options | {"normalize_advantage": True})
+    later = cost_advantages(
+        advantages, lengths, np.array([1, 0]), **options | {"discount_visitation": True}
+    )
+    np.testing.assert_array_equal(later, -advantages * [0.5, 0.25, 1, 0.5, 0.25])
+    normalised = cost_advantages(
+        advantages, lengths, times, **options | {"normalize_advantage": True}
+    )
     assert normalised.mean() == pytest.approx(0.0, abs=1e-12)
     assert normalised.std() == pytest.approx(1.0)
     assert np.corrcoef(normalised, advantages)[0, 1] == pytest.approx(-1.0)

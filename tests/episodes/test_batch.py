@@ -69,6 +69,8 @@ def numbered_batch(lengths, *, is_dict=False):
         rewards=2 * steps,
         log_probs=3 * steps,
         terminal_values=np.arange(float(len(lengths))),
+        times=np.zeros(len(lengths), dtype=int),
+        trajectories=np.arange(len(lengths)),
     )
 
 
@@ -112,7 +114,7 @@ def test_split_deals_every_episode_once(lengths, n_groups):
 
 @given(st.integers(0, 20), st.integers(1, 8), st.integers(0, 20))
 def test_every_episode_is_dealt_once(n_episodes, n_groups, first):
-    groups = round_robin_split(n_episodes, n_groups, first)
+    groups = round_robin_split(np.arange(n_episodes), n_groups, first)
     sizes = [len(group) for group in groups]
     assert len(groups) == n_groups
     assert max(sizes) - min(sizes) <= 1
@@ -123,10 +125,11 @@ def test_every_episode_is_dealt_once(n_episodes, n_groups, first):
 
 @given(st.lists(st.integers(0, 6), min_size=1, max_size=4), st.integers(1, 3))
 def test_dealing_goes_on_where_another_rank_stopped(counts, n_groups):
-    whole = round_robin_split(sum(counts), n_groups)
+    whole = round_robin_split(np.arange(sum(counts)), n_groups)
     starts = np.cumsum(counts) - counts
     parts = [
-        round_robin_split(n, n_groups, first=start) for n, start in zip(counts, starts, strict=True)
+        round_robin_split(np.arange(n), n_groups, first=start)
+        for n, start in zip(counts, starts, strict=True)
     ]
     for k, group in enumerate(whole):
         joined = [part[k] + start for part, start in zip(parts, starts, strict=True)]

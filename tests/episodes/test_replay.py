@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from sb3_crpn.curvature import PairWeights
+from sb3_crpn.curvature import Causal
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from sb3_crpn.episodes import Replay
-from sb3_crpn.episodes import replay as module
+from sb3_crpn.episodes import batch as episode_batch
 from sb3_crpn.episodes.advantages import cost_advantages, generalized_advantages
 from sb3_crpn.episodes.buffer import CHUNK
 from sb3_crpn.episodes.replay import MAX_RATIO, MIN_EFFECTIVE_SIZE
@@ -62,7 +62,11 @@ def test_rollout_of_the_present_policy_has_the_weights_of_a_fresh_one(
     np.testing.assert_allclose(
         again.cost_advantages,
         cost_advantages(
-            advantages if baseline else advantages + values, batch.lengths, gamma=GAMMA, **options
+            advantages if baseline else advantages + values,
+            batch.lengths,
+            batch.times,
+            gamma=GAMMA,
+            **options,
         ),
         rtol=1e-5,
         atol=1e-6,
@@ -118,7 +122,7 @@ def test_reused_bandit_gives_the_exact_gradient_and_curvature_of_the_present_pol
         terminal_values=np.zeros(1200),
     )
     (again,) = kept(batch).reweighted(policy, **RAW)
-    group = EpisodeDerivatives(policy, actor, again, PairWeights("causal", 1.0))
+    group = EpisodeDerivatives(policy, actor, again, Causal(1.0))
     bias = actor.vector.clone().requires_grad_()
 
     def cost(theta):
@@ -170,7 +174,7 @@ def test_long_rollouts_are_evaluated_in_pieces():
 
 def test_no_episodes_on_this_rank(monkeypatch):
     of_another = torch.tensor([10.0, 10.0, 10.0], dtype=torch.float64)
-    monkeypatch.setattr(module, "all_sum", lambda tensor: tensor + of_another)
+    monkeypatch.setattr(episode_batch, "all_sum", lambda tensor: tensor + of_another)
     policy, _ = small_policy("discrete")
     batch = rollout(policy).take(np.zeros(0, dtype=int))
     (again,) = kept(batch).reweighted(policy, **RAW)

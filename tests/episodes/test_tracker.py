@@ -10,10 +10,15 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_crpn import CRPN
-from sb3_crpn.algorithm import collection
-from sb3_crpn.episodes import EpisodeTracker, episodes_per_env, steps_to_quota
+from sb3_crpn.algorithm import rollouts
+from sb3_crpn.episodes import (
+    EpisodeTracker,
+    RolloutSize,
+    collector,
+    episodes_per_env,
+    steps_to_quota,
+)
 from sb3_crpn.episodes.batch import episode_starts, episode_time
-from sb3_crpn.episodes.tracker import EpisodeEnd
 from tests.mdp import differs, random_mdp, random_parameters, tabular_crpn
 
 
@@ -32,57 +37,67 @@ def test_quota_from_steps():
     assert steps_to_quota(1000, 20.0) == 50
 
 
+def begun(n_episodes, at_episode_start, horizon=None):
+    tracker = EpisodeTracker()
+    tracker.begin(RolloutSize(0, n_episodes, horizon), np.array(at_episode_start))
+    return tracker
+
+
 def run(tracker, dones):
-    return [end for row in dones for end in tracker.advance(np.array(row, bool))]
+    """The segments that these steps end, as (env, start, length, cut)."""
+    segments = [end for row in dones for end in tracker.advance(np.array(row, bool))]
+    assert all(segment.time == 0 for segment in segments)
+    return [(s.env, s.start, s.length, s.cut) for s in segments]
 
 
 def test_each_environment_delivers_its_first_episodes_however_long():
-    tracker = EpisodeTracker(np.array([2, 1]), np.array([True, True]))
-    assert run(tracker, [[1, 0], [0, 0]]) == [EpisodeEnd(0, 0, 1, False)]
-    assert tracker.longest == 2
+    tracker = begun(3, [True, True])
+    assert run(tracker, [[1, 0], [0, 0]]) == [(0, 0, 1, False)]
     assert not tracker.complete
     assert run(tracker, [[1, 0], [1, 0], [1, 1]]) == [
-        EpisodeEnd(0, 1, 2, False),
-        EpisodeEnd(1, 0, 5, False),
+        (0, 1, 2, False),
+        (1, 0, 5, False),
     ]
     assert tracker.complete
     assert not tracker.needs_reset
 
 
 def test_what_began_before_the_rollout_is_not_an_episode():
-    tracker = EpisodeTracker(np.array([1, 1]), np.array([False, True]))
+    tracker = begun(2, [False, True])
     ends = run(tracker, [[0, 0], [1, 0], [0, 1], [0, 1], [1, 0]])
-    assert ends == [EpisodeEnd(1, 0, 3, False), EpisodeEnd(0, 2, 3, False)]
+    assert ends == [(1, 0, 3, False), (0, 2, 3, False)]
 
 
 def test_the_horizon_cuts_and_a_restart_begins_the_next_episode():
-    tracker = EpisodeTracker(np.array([2, 1]), np.array([True, True]), horizon=2)
+    tracker = begun(3, [True, True], horizon=2)
     ends = run(tracker, [[0, 0], [1, 0]])
-    assert ends == [EpisodeEnd(0, 0, 2, False), EpisodeEnd(1, 0, 2, True)]
+    assert ends == [(0, 0, 2, False), (1, 0, 2, True)]
     assert not tracker.needs_reset
-    assert run(tracker, [[0, 0], [0, 1]]) == [EpisodeEnd(0, 2, 2, True)]
+    assert run(tracker, [[0, 0], [0, 1]]) == [(0, 2, 2, True)]
     assert tracker.complete
 
-    tracker = EpisodeTracker(np.array([2]), np.array([True]), horizon=2)
+    tracker = begun(2, [True], horizon=2)
     run(tracker, [[0], [0], [0]])
     assert tracker.needs_reset
     tracker.restart()
     assert not tracker.needs_reset
-    assert run(tracker, [[0], [0]]) == [EpisodeEnd(0, 3, 2, True)]
+    assert run(tracker, [[0], [0]]) == [(0, 3, 2, True)]
 
 
 def test_an_environment_without_quota_is_ignored():
-    tracker = EpisodeTracker(np.array([1, 0]), np.array([True, True]))
+    tracker = begun(1, [True, True])
     assert run(tracker, [[0, 1], [0, 1]]) == []
-    assert run(tracker, [[1, 1]]) == [EpisodeEnd(0, 0, 3, False)]
+    assert run(tracker, [[1, 1]]) == [(0, 0, 3, False)]
 
 
 class FirstToFinish(EpisodeTracker):
     """The mistake: the first m episodes to finish, whichever environment they come from."""
 
-    def __init__(self, quotas, fresh, horizon=None):
-        super().__init__(np.full_like(quotas, quotas.sum()), fresh, horizon)
-        self._missing = int(quotas.sum())
+    def begin(self, size, at_episode_start):
+        super().begin(size, at_episode_start)
+        self._missing = size.n_episodes
+        self._remaining[:] = self._missing
+        self._recording = at_episode_start.copy()
 
     @property
     def complete(self):
@@ -111,7 +126,7 @@ def lengths_and_returns(n_repeats=150, n_episodes=12):
 
 def test_kept_episodes_are_not_biased_towards_short_ones(monkeypatch):
     assert not differs(*lengths_and_returns())
-    monkeypatch.setattr(collection, "EpisodeTracker", FirstToFinish)
+    monkeypatch.setattr(rollouts, "EpisodeTracker", FirstToFinish)
     means, exact = lengths_and_returns()
     assert differs(means, exact)
     assert np.mean(means, axis=0)[0] < 0.9 * exact[0]
@@ -153,7 +168,7 @@ class Updates(BaseCallback):
     def _on_rollout_end(self):
         self.lengths.append(self.model.rollout_buffer.lengths.tolist())
         self.timesteps.append(self.num_timesteps)
-        self.used.append(self.model.rollout_buffer.used_fraction)
+        self.used.append(self.model._used_fraction)
 
 
 def clock_crpn(*durations, monitor=True, **arguments):
@@ -213,7 +228,7 @@ def test_the_horizon_makes_episodes_of_an_environment_that_never_ends():
 
 
 def test_an_environment_that_never_ends_is_an_error_that_names_the_way_out(monkeypatch):
-    monkeypatch.setattr(collection, "ENDLESS", 50)
+    monkeypatch.setattr(collector, "ENDLESS", 50)
     model, _ = clock_crpn([np.inf], n_episodes=1)
     before = model.actor.vector
     with pytest.raises(ValueError, match=r"no episode ended within 50 steps.*horizon=H"):

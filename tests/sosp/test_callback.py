@@ -86,7 +86,8 @@ def test_normalisation_is_that_of_training():
     assert not np.allclose(own.obs_rms.mean, 0.0)
 
 
-@pytest.mark.parametrize("wrong", [{"eval_freq": 0}, {"stop_at_sosp": 1}])
-def test_wrong_arguments_are_named(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        SospCallback(**{"eval_freq": 1, "n_episodes": 4, "epsilon": 1.0, "eval_env": None, **wrong})
+def test_wrong_combinations_are_named_by_the_constructor():
+    with pytest.raises(ValueError, match=r"^SospCallback: bounds=None"):
+        SospCallback(1, TabularEnv(blind()), 4, 1.0, interval="bernstein")
+    with pytest.raises(TypeError, match=r"^SospCallback has no argument n_eigenvectors"):
+        SospCallback(1, TabularEnv(blind()), 4, 1.0, n_eigenvectors=3)

@@ -3,12 +3,11 @@ import pytest
 import torch
 from torch.func import jacrev
 
-from sb3_crpn.curvature import PairWeights
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.theory import Constants, ScoreBounds, softmax_linear
 from tests.mdp import TabularMDP, random_mdp, random_parameters, tabular_crpn
-from tests.policies import small_policy
+from tests.policies import estimator_of, small_policy
 
 NAMES = ["cost_bound", "M_g", "M_H", "L_H", "G_g", "G_H", "M_1", "M_2"]
 
@@ -79,7 +78,7 @@ def episode_estimates(policy, actor, batch, estimator="trajectory"):
     gradients, hessians = [], []
     for episode in range(batch.n_episodes):
         group = EpisodeDerivatives(
-            policy, actor, batch.take(np.array([episode])), PairWeights(estimator)
+            policy, actor, batch.take(np.array([episode])), estimator_of(estimator)
         )
         gradients.append(group.gradient())
         hessians.append(torch.stack([group.hessian_product(v) for v in eye]))
@@ -93,7 +92,7 @@ def test_estimates_of_single_episodes_hold(estimator):
     for scale in (0.3, 3.0):
         theta = scale * random_parameters(mdp)
         model.actor.assign(theta)
-        batch = model._episode_batch(model._collect_fresh(24, None))
+        batch = model._episode_batch(model._collect_evaluation_episodes(24, None))
         gradients, hessians = episode_estimates(model.policy, model.actor, batch, estimator)
         theta = model.actor.vector
         assert float(gradients.norm(dim=1).max()) <= constants.G_g
@@ -120,6 +119,8 @@ def test_estimates_of_single_episodes_are_attained():
         rewards=np.zeros(H),
         log_probs=np.zeros(H),
         terminal_values=np.zeros(1),
+        times=np.zeros(1, dtype=int),
+        trajectories=np.arange(1),
     )
     gradients, hessians = episode_estimates(policy, actor, batch)
     constants = Constants(K, softmax_linear(1.0), H, len(actor), gamma)

@@ -265,7 +265,7 @@ def test_epsilon_is_checked(recipe, epsilon):
 @pytest.mark.parametrize("recipe", [high_probability_recipe, approximate_recipe])
 @pytest.mark.parametrize("probability", [0.0, 1.0, float("nan")])
 def test_failure_probability_is_checked(recipe, probability):
-    with pytest.raises(ValueError, match=r"failure_probability=.* must be in \(0, 1\)"):
+    with pytest.raises(ValueError, match=r"failure_probability=.* a finite number in \(0, 1\)"):
         recipe(BANDIT, 0.5, probability)
 
 

@@ -7,7 +7,7 @@ from benchmarks.exact import lipschitz_constants, random_mdp
 from benchmarks.experiments import cartpole, escape, sample_complexity, variance
 from benchmarks.experiments.learners import make_learner
 from benchmarks.experiments.sample_complexity import PROBLEMS, exact_updates
-from sb3_crpn.curvature import PairWeights
+from sb3_crpn.curvature import Causal
 from tests.mdp import differs
 
 
@@ -72,7 +72,7 @@ def test_baselines_take_away_variance_and_no_truth(kind):
     values = mdp.values(theta).numpy()
     if kind == "fitted":
         values = np.tile(variance._mean_returns(mdp, fit), (3, 1))
-    weights = PairWeights("causal", 1.0)
+    weights = Causal(1.0)
     hessians = torch.stack(
         [
             variance._hessian(model, variance._less_baseline(mdp, batch, values), weights)

@@ -6,46 +6,50 @@ from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
-from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_crpn.distributed import all_sum, broadcast, broadcast_state, local_mode, rank, world_size
-from sb3_crpn.episodes.batch import FloatArray
+from sb3_crpn.arrays import FloatArray
+from sb3_crpn.distributed import all_sum, broadcast, broadcast_state, local_mode, world_size
+from sb3_crpn.episodes.running_moments import RunningMoments
 
 
-class DistributedTraining(BaseAlgorithm):
-    """Starts all ranks from rank 0's policy and statistics; rank 0 alone logs and calls back."""
+class DistributedTraining:
+    """The communication of one call of ``learn``; on one process there is none.
 
-    _statistics: SharedMoments | None = None
+    All ranks start from rank 0's policy and statistics. Rank 0 alone logs, calls back and saves.
 
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: Any = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
+    Parameters
+    ----------
+    policy
+        Gets the bits of rank 0's.
+    normalizer
+        The environment's ``VecNormalize``, before its first reset; ``None``: there is none.
+    """
+
+    def __init__(self, policy: BasePolicy, normalizer: VecNormalize | None) -> None:
+        self._moments = None
         if world_size() > 1:
-            broadcast_state(self.policy)
-            normalizer = self.get_vec_normalize_env()
-            # before the first reset adds to them
-            self._statistics = None if normalizer is None else SharedMoments(normalizer)
-        if rank() > 0:
-            callback, progress_bar = None, False
-            self.set_logger(Logger(folder=None, output_formats=[]))
-        total_timesteps, callback = super()._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
-        return total_timesteps, callback if world_size() == 1 else RankZeroCallback(callback)
+            broadcast_state(policy)
+            if normalizer is not None:
+                self._moments = SharedMoments(normalizer)
 
-    def _share_statistics(self) -> None:
-        """Add up what the ranks' ``VecNormalize`` have seen since they last agreed."""
-        if self._statistics is not None and world_size() > 1:
-            self._statistics.merge()
+    def callback(self, callback: BaseCallback) -> BaseCallback:
+        """Return the callback of this rank."""
+        return callback if world_size() == 1 else RankZeroCallback(callback)
+
+    def totals(self, *counts: float) -> list[float]:
+        """Return the sums of the ranks' counts, and merge what their ``VecNormalize`` have seen."""
+        totals: list[float] = all_sum(torch.tensor(counts, dtype=torch.float64)).tolist()
+        if self._moments is not None and world_size() > 1:
+            self._moments.merge()
+        return totals
+
+
+def share_policy(policy: BasePolicy) -> None:
+    """Give every rank the policy of rank 0, bit for bit."""
+    broadcast_state(policy)
 
 
 class RankZeroCallback(CallbackList):
@@ -98,11 +102,7 @@ class SharedMoments:
     """
 
     def __init__(self, normalizer: VecNormalize) -> None:
-        observed: Any = normalizer.obs_rms if normalizer.norm_obs else {}
-        self._moments: list[RunningMeanStd] = [
-            *(observed.values() if isinstance(observed, dict) else [observed]),
-            normalizer.ret_rms,
-        ]
+        self._moments = RunningMoments(normalizer)
         self._write(broadcast(torch.from_numpy(self._read())).numpy())
 
     def merge(self) -> None:
@@ -122,17 +122,20 @@ class SharedMoments:
         """Return count, mean and variance of every entry, [3, n]."""
         return np.concatenate(
             [
-                [np.full(moment.mean.size, moment.count), moment.mean.ravel(), moment.var.ravel()]
-                for moment in self._moments
+                [np.full(np.size(mean), count), np.ravel(mean), np.ravel(variance)]
+                for count, mean, variance in self._moments.read()
             ],
             axis=1,
         )
 
     def _write(self, common: FloatArray) -> None:
         self._common = common
-        ends = np.cumsum([moment.mean.size for moment in self._moments])
+        shapes = [np.shape(mean) for _, mean, _ in self._moments.read()]
+        ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
         pieces = np.split(common, ends[:-1], axis=1)
-        for moment, (count, mean, variance) in zip(self._moments, pieces, strict=True):
-            shape = moment.mean.shape
-            moment.count = float(count[0])
-            moment.mean, moment.var = mean.reshape(shape), variance.reshape(shape)
+        self._moments.write(
+            [
+                (float(count[0]), mean.reshape(shape), variance.reshape(shape))
+                for shape, (count, mean, variance) in zip(shapes, pieces, strict=True)
+            ]
+        )

@@ -1,0 +1,323 @@
+"""Simulating a policy: one collector for training, for estimates and for certificates."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
+
+from sb3_crpn.arrays import Array, BoolArray, FloatArray, Observations
+from sb3_crpn.episodes.buffer import EpisodeRolloutBuffer
+from sb3_crpn.episodes.running_moments import RunningMoments
+from sb3_crpn.episodes.tracker import RolloutSize, Segment, Tracker
+from sb3_crpn.policy import environment_actions, sample_actions, to_tensor
+
+# An environment is taken to be endless when no episode ends within so many steps: nearly twice
+# the longest episode in common use (Atari's 108,000 frames at a frame skip of 4).
+ENDLESS = 50_000
+
+
+@dataclass(frozen=True)
+class Transition:
+    """One step of every environment, under the names of SB3's ``collect_rollouts``."""
+
+    n_steps: int
+    obs_tensor: Observations
+    actions: Array
+    clipped_actions: Array
+    new_obs: Any
+    rewards: FloatArray
+    dones: BoolArray
+    infos: list[dict[str, Any]]
+
+
+class Collector:
+    """Steps a vectorised environment with a policy until a tracker has what it wants.
+
+    Everything that enters from the environment is cast and checked here, once: dones to bool,
+    rewards and observations to arrays, terminal observations to those of the space.
+
+    Parameters
+    ----------
+    policy
+        In evaluation mode; actions are drawn from PyTorch's generator.
+    env
+        The environments.
+    bootstrap_truncated
+        Whether an episode that a time limit ended is bootstrapped with V of its last observation.
+    uses_critic
+        Whether V is used at all.
+    sde_sample_freq
+        Steps after which gSDE's noise is drawn anew; -1: at the start of the rollout alone.
+
+    Attributes
+    ----------
+    observations, at_episode_start
+        Where the environments stand, [n_envs, …] and [n_envs].
+    timestep
+        Steps of all environments so far, for messages.
+    """
+
+    def __init__(
+        self,
+        policy: ActorCriticPolicy,
+        env: VecEnv,
+        *,
+        bootstrap_truncated: bool,
+        uses_critic: bool,
+        sde_sample_freq: int = -1,
+    ) -> None:
+        self.policy, self.env = policy, env
+        self.observations: Any = None
+        self.at_episode_start: BoolArray = np.ones(env.num_envs, dtype=np.bool_)
+        self.timestep = 0
+        self._endless_after = self._warn_after = ENDLESS
+        self._bootstrap_truncated = bootstrap_truncated
+        self._uses_critic = uses_critic
+        self._sde_sample_freq = sde_sample_freq
+        self.can_reset = _early_resets_allowed(env)
+        normalizer = unwrap_vec_normalize(env)
+        self._moments = None if normalizer is None else RunningMoments(normalizer)
+        self._raw_rewards = _raw_rewards(normalizer)
+        self._start_time = time.time()
+
+    def stand(self, observations: Any, at_episode_start: Any) -> None:
+        """Say where the environments stand; ``None``: reset them."""
+        if observations is None:
+            self.reset()
+            return
+        self.observations = _as_arrays(observations)
+        self.at_episode_start = np.asarray(at_episode_start).astype(np.bool_)
+        self._require_finite("observation", self.observations)
+
+    def reset(self) -> None:
+        """Reset all environments."""
+        before = None if self._moments is None else self._moments.snapshot()
+        self.observations = _as_arrays(self.env.reset())
+        self.at_episode_start = np.ones(self.env.num_envs, dtype=np.bool_)
+        self._require_finite("observation", self.observations, before)
+
+    def expect_an_end_within(self, n_steps: int) -> None:
+        """Take the environments for endless after ``n_steps`` steps; warn after a fifth of them.
+
+        For environments without a time limit that is known, and whole episodes.
+        """
+        self._endless_after, self._warn_after = min(ENDLESS, n_steps), max(1, n_steps // 5)
+
+    def collect(
+        self,
+        buffer: EpisodeRolloutBuffer,
+        tracker: Tracker,
+        size: RolloutSize,
+        on_step: Callable[[Transition], bool] = lambda transition: True,
+    ) -> bool:
+        """Fill the buffer until the tracker is complete.
+
+        Returns
+        -------
+        bool
+            False if ``on_step`` did: the rollout is then not complete.
+
+        Raises
+        ------
+        ValueError
+            A reward or an observation is not finite, or no episode comes to an end.
+        """
+        if tracker.whole_episodes and self.can_reset and not self.at_episode_start.all():
+            self.reset()
+        tracker.begin(size, self.at_episode_start)
+        buffer.reset()
+        self._n_steps = self._last_end = 0
+        self._returns = np.zeros(self.env.num_envs)
+        unknown = torch.zeros(self.env.num_envs)  # V and log π: evaluated at the end, all at once
+        while not tracker.complete:
+            self._draw_noise()
+            transition = self._step()
+            recording = tracker.recording
+            segments = list(tracker.advance(transition.dones))
+            if size.horizon is not None:
+                self._report_cut_episodes(segments, recording, transition)
+            if not on_step(transition):
+                return False
+            buffer.add(
+                self.observations,
+                transition.actions,
+                transition.rewards,
+                self.at_episode_start,
+                unknown,
+                unknown,
+            )
+            for segment in segments:
+                buffer.close(segment, self._next_observation(segment, tracker, transition))
+            self.observations, self.at_episode_start = transition.new_obs, transition.dones
+            if tracker.needs_reset and self.can_reset:
+                self.reset()
+                tracker.restart()
+            if tracker.whole_episodes:
+                self._require_progress(segments)
+        buffer.finish(self.policy if self._uses_critic else None, self.observations)
+        return True
+
+    def _draw_noise(self) -> None:
+        """Draw gSDE's exploration matrices, at the steps at which SB3 does."""
+        if not self.policy.use_sde:
+            return
+        frequency = self._sde_sample_freq
+        if self._n_steps == 0 or (frequency > 0 and self._n_steps % frequency == 0):
+            self.policy.reset_noise(self.env.num_envs)
+
+    def _step(self) -> Transition:
+        """Take one step in every environment; what ``VecNormalize`` learns of NaN is undone."""
+        obs_tensor = to_tensor(self.policy, self.observations)
+        actions = sample_actions(self.policy, obs_tensor)
+        clipped_actions = environment_actions(self.policy, actions)
+        before = None if self._moments is None else self._moments.snapshot()
+        new_obs, rewards, dones, infos = self.env.step(clipped_actions)
+        self._n_steps += 1
+        self.timestep += self.env.num_envs
+        new_obs, rewards = _as_arrays(new_obs), np.asarray(rewards)
+        self._require_finite("reward", rewards, before)
+        self._require_finite("observation", new_obs, before)
+        return Transition(
+            self._n_steps,
+            obs_tensor,
+            actions,
+            clipped_actions,
+            new_obs,
+            rewards,
+            np.asarray(dones).astype(np.bool_),
+            infos,
+        )
+
+    def _next_observation(self, segment: Segment, tracker: Tracker, transition: Transition) -> Any:
+        """Return the state after a segment that is to be bootstrapped with its value, or ``None``.
+
+        Where an adapter gives no ``terminal_observation``, nothing is bootstrapped, as in SB3.
+        """
+        if segment.cut:
+            if tracker.whole_episodes and not self._bootstrap_truncated:
+                return None
+            new_obs = transition.new_obs
+            if isinstance(new_obs, dict):
+                return {key: array[segment.env] for key, array in new_obs.items()}
+            return new_obs[segment.env]
+        info = transition.infos[segment.env]
+        last_obs = info.get("terminal_observation")
+        truncated = self._bootstrap_truncated and info.get("TimeLimit.truncated", False)
+        if not truncated or last_obs is None:
+            return None
+        last_obs = as_observation(self.env.observation_space, last_obs)
+        self._require_finite("terminal observation", last_obs)
+        return last_obs
+
+    def _report_cut_episodes(
+        self, segments: list[Segment], recording: BoolArray, transition: Transition
+    ) -> None:
+        """Report an episode that the horizon cut as ``Monitor`` would, and only those recorded."""
+        rewards = self._raw_rewards()
+        self._returns += transition.rewards if rewards is None else rewards
+        for env in np.flatnonzero(~recording & transition.dones):
+            transition.infos[env].pop("episode", None)
+        for segment in segments:
+            if segment.cut:
+                transition.infos[segment.env]["episode"] = {
+                    "r": float(self._returns[segment.env]),
+                    "l": segment.length,
+                    "t": round(time.time() - self._start_time, 6),
+                }
+            self._returns[segment.env] = 0.0
+        self._returns[~recording] = 0.0
+
+    def _require_finite(self, what: str, value: Any, moments: Any = None) -> None:
+        """Raise when the environment returned NaN or infinity; ``VecNormalize`` forgets it."""
+        if all_finite(value):
+            return
+        if self._moments is not None and moments is not None:
+            self._moments.restore(moments)
+        raise ValueError(
+            f"the environment returned a non-finite {what} at timestep {self.timestep}: {value}; "
+            "the policy is unchanged. SB3's VecCheckNan finds the source"
+        )
+
+    def _require_progress(self, segments: list[Segment]) -> None:
+        """Warn, and later raise, when no episode comes to an end."""
+        if segments:
+            self._last_end = self._n_steps
+        without_end = self._n_steps - self._last_end
+        if without_end == self._warn_after < self._endless_after:
+            warnings.warn(
+                f"no episode has ended within {without_end} steps, and the environment has no time "
+                f"limit that is known: training stops after {self._endless_after} steps without "
+                "an end",
+                stacklevel=2,
+            )
+        if without_end >= self._endless_after:
+            raise ValueError(
+                f"no episode ended within {without_end} steps, but whole episodes are asked for: "
+                "pass horizon=H to cut them after H steps, wrap the environment in "
+                'gymnasium.wrappers.TimeLimit, or learn from timesteps with rollout="timesteps"'
+            )
+
+
+def all_finite(value: Any) -> bool:
+    """Tell whether an array, or each one of a dict, is free of NaN and infinity."""
+    arrays = value.values() if isinstance(value, dict) else (value,)
+    return all(
+        np.isfinite(array).all() for array in arrays if np.issubdtype(array.dtype, np.floating)
+    )
+
+
+def as_observation(space: spaces.Space[Any], observation: Any) -> Any:
+    """Return one observation as an array of the space's shape and dtype, or a dict of them.
+
+    Environments may return Python numbers, lists, or dicts of such.
+    """
+    if isinstance(space, spaces.Dict):
+        return {
+            key: as_observation(subspace, observation[key])
+            for key, subspace in space.spaces.items()
+        }
+    return np.asarray(observation, dtype=space.dtype).reshape(space.shape or ())
+
+
+def _as_arrays(observations: Any) -> Any:
+    """Return a batch of observations as an array, or a dict of arrays."""
+    if isinstance(observations, dict):
+        return {key: np.asarray(array) for key, array in observations.items()}
+    return np.asarray(observations)
+
+
+def _early_resets_allowed(env: VecEnv) -> bool:
+    """Whether every environment may be reset in mid-episode: SB3's ``Monitor`` can forbid it.
+
+    Adapters around other libraries' vectorised environments need not answer: they have no
+    ``Monitor``.
+    """
+    try:
+        wrapped = env.env_is_wrapped(Monitor)
+    except (AttributeError, NotImplementedError):
+        return True
+    for index, monitored in enumerate(wrapped):
+        if monitored:
+            try:
+                if not env.get_attr("allow_early_resets", index)[0]:
+                    return False
+            except AttributeError:  # a vectorised environment that keeps the statistics itself
+                continue
+    return True
+
+
+def _raw_rewards(normalizer: VecNormalize | None) -> Callable[[], FloatArray | None]:
+    """Return a function that gives the last step's rewards before ``VecNormalize`` scaled them."""
+    if normalizer is None or not normalizer.norm_reward:
+        return lambda: None
+    return normalizer.get_original_reward

@@ -1,0 +1,136 @@
+"""docs/EXTENDING.md, followed: variants defined here are trained with, saved and loaded."""
+
+import copy
+import math
+from dataclasses import dataclass
+
+import pytest
+import torch
+
+from sb3_crpn import CRPN
+from sb3_crpn.algorithm.solvers import SOLVERS, DenseSolver
+from sb3_crpn.cubic import CubicStep
+from sb3_crpn.cubic.approximate import cauchy_radius
+from sb3_crpn.curvature import (
+    HESSIAN_ESTIMATORS,
+    METRICS,
+    SHRINKAGES,
+    Causal,
+    Constant,
+    Fisher,
+    JamesStein,
+)
+from tests.training import make, same, several, tensors
+
+
+@dataclass(frozen=True)
+class AbsoluteHessian:
+    """M = |H| + εI on the Krylov space (Dauphin et al., NeurIPS 2014)."""
+
+    damping: float = 1e-3
+
+    def generator(self, estimate):
+        return estimate.hessian
+
+    def whitening(self, form):
+        eigenvalues, vectors = torch.linalg.eigh(form)
+        return ((eigenvalues.abs() + self.damping) ** -0.5)[:, None] * vectors.T
+
+
+class Diagonal:
+    """W_ij = A_i δ_ij: no cross-time terms, `Causal(0.0)` written out."""
+
+    def apply(self, cost_advantages, lengths, u):
+        return cost_advantages.reshape(-1, *[1] * (u.ndim - 1)) * u
+
+
+class Smoothed:
+    """The James-Stein factor, averaged over updates."""
+
+    def __init__(self):
+        self.mean = 0.0
+
+    def factor(self, hessians, weights):
+        self.mean += 0.1 * (JamesStein().factor(hessians, weights) - self.mean)
+        return self.mean
+
+
+class CauchySolver:
+    """The minimiser along -g."""
+
+    def needs_matrix(self, dim):
+        return False
+
+    def solve(self, model, alpha):
+        g = model.gradient
+        norm = float(g.norm())
+        curvature = float(g @ model.product(g)) / norm**2
+        radius = cauchy_radius(norm, curvature, alpha)
+        decrease = norm * radius - curvature * radius**2 / 2 - alpha * radius**3 / 6
+        return CubicStep(
+            -radius / norm * g, alpha * radius / 2, decrease, 1, math.nan, False, "Cauchy point"
+        )
+
+
+VARIANTS = {
+    "metric": (METRICS, AbsoluteHessian),
+    "hessian_estimator": (HESSIAN_ESTIMATORS, Diagonal),
+    "hessian_shrinkage": (SHRINKAGES, Smoothed),
+    "solver": (SOLVERS, CauchySolver),
+}
+
+
+def trained(**arguments):
+    return make(CRPN, several(2), n_episodes=4, **arguments).learn(80)
+
+
+@pytest.mark.parametrize("argument", VARIANTS)
+def test_an_object_trains_and_goes_on_after_loading(argument, tmp_path):
+    variant = VARIANTS[argument][1]
+    model = trained(**{argument: variant()})
+    assert not same(model, tensors(trained()))
+    model.save(tmp_path / "model")
+    state, control = dict(vars(getattr(model, argument))), copy.copy(model.kl_control)
+    model.learn(80, reset_num_timesteps=False)
+    loaded = CRPN.load(tmp_path / "model", env=several(2), device="cpu")
+    assert isinstance(getattr(loaded, argument), variant)
+    assert vars(getattr(loaded, argument)) == state
+    assert loaded.kl_control == control
+    loaded.learn(80, reset_num_timesteps=False)
+    assert same(loaded, tensors(model))
+
+
+@pytest.mark.parametrize("argument", VARIANTS)
+def test_a_registered_name_is_the_object(argument, tmp_path, monkeypatch):
+    registry, variant = VARIANTS[argument]
+    if argument == "hessian_shrinkage":  # a name stands for an object without state
+        variant = JamesStein
+    with pytest.raises(ValueError, match=f"{argument}='mine'.* must be") as error:
+        make(CRPN, **{argument: "mine"})
+    assert all(repr(name) in str(error.value) for name in registry)
+    monkeypatch.setitem(registry, "mine", lambda algorithm: variant())
+    named = trained(**{argument: "mine"})
+    assert same(named, tensors(trained(**{argument: variant()})))
+    named.save(tmp_path / "model")
+    assert getattr(CRPN.load(tmp_path / "model", device="cpu"), argument) == "mine"
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ({"metric": "fisher"}, {"metric": Fisher(0.1)}),
+        ({"hessian_lambda": 0.5}, {"hessian_estimator": Causal(0.5)}),
+        ({"hessian_estimator": "causal", "hessian_lambda": 0.0}, {"hessian_estimator": Diagonal()}),
+        ({"hessian_shrinkage": 0.5}, {"hessian_shrinkage": Constant(0.5)}),
+        ({"solver": "dense"}, {"solver": DenseSolver()}),
+    ],
+)
+def test_names_stand_for_objects(name, value):
+    first, second = trained(**name).actor.vector, trained(**value).actor.vector
+    torch.testing.assert_close(first, second, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("argument", VARIANTS)
+def test_a_class_is_no_object(argument):
+    with pytest.raises(ValueError, match=f"{argument}=<class .* must be"):
+        make(CRPN, **{argument: VARIANTS[argument][1]})
