@@ -17,7 +17,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -43,23 +42,24 @@ MEMORY = 0.9  # by which the past fades in an update
 class AutoKL(ConfirmedCRPN):
     """CRPN whose target is c/2 (slope/curvature)² of confirmed slope and secant curvature.
 
-    Parameters
+    Attributes
     ----------
     fraction
         c.
     """
 
-    def __init__(self, *args: Any, fraction: float = 1.0, **kwargs: Any) -> None:
-        self._fraction = fraction
+    fraction: float = 1.0
+
+    def _setup_model(self) -> None:
         # fading sums of 1, slope, length · (slope - next slope), length²
         self._sums = np.zeros(4)
-        super().__init__(*args, **kwargs)
+        super()._setup_model()
 
-    def _scaled_target_kl(self, batch: EpisodeBatch) -> float:
-        scaled = super()._scaled_target_kl(batch)
+    def _update_target_kl(self, batch: EpisodeBatch) -> float:
+        scaled = super()._update_target_kl(batch)
         assert scaled is not None
         assert self.target_kl is not None
-        ratio = self._fraction * self._parabola_kl() / DEFAULT_KL
+        ratio = self.fraction * self._parabola_kl() / DEFAULT_KL
         return DEFAULT_KL * min(HIGHEST, max(LOWEST, ratio)) * scaled / self.target_kl
 
     def _parabola_kl(self) -> float:
@@ -75,7 +75,7 @@ class AutoKL(ConfirmedCRPN):
                 self._sums[2:] += length * drop, length**2
         count, slopes, drops, squares = self._sums
         if count == 0.0 or squares == 0.0:
-            return DEFAULT_KL / self._fraction  # nothing is known
+            return DEFAULT_KL / self.fraction  # nothing is known
         return parabola_kl(slopes / count, drops / squares)
 
 
@@ -89,8 +89,9 @@ def jobs(seeds: int) -> list[Row]:
 
 def measure(env: str, arm: str, seed: int) -> list[Row]:
     """Train once."""
-    model = make_model(env, seed, AutoKL, target_kl=DEFAULT_KL, fraction=FRACTIONS[arm])
+    model = make_model(env, seed, AutoKL, target_kl=DEFAULT_KL)
     assert isinstance(model, AutoKL)
+    model.fraction = FRACTIONS[arm]
     returns = Returns(BUDGET)
     model.learn(BUDGET, callback=returns)
     targets = [record["target_kl"] for record in model.records]

@@ -16,7 +16,6 @@ least, to second order. It is compared with the entry's ``target_kl``, chosen by
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -28,8 +27,7 @@ from benchmarks.experiments.crossfit import CrossFit, confirm_natural_step
 from benchmarks.experiments.study import PALETTE, Row, Study, interval
 from benchmarks.experiments.tasks import Returns, make_model
 from sb3_crpn import CRPN
-from sb3_crpn.algorithm.step import PolicyStep
-from sb3_crpn.curvature import CurvatureEstimate, LocalModel
+from sb3_crpn.curvature import CurvatureEstimate
 from sb3_crpn.episodes import EpisodeBatch
 
 ENVS = ("CartPole-v1", "Pendulum-v1", "Acrobot-v1", "HalfCheetah-v5", "LunarLander-v3")
@@ -58,12 +56,26 @@ class ConfirmedCRPN(CRPN):
         One row per update.
     """
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def _setup_model(self) -> None:
         self.records: list[Row] = []
         self._last_step: Tensor | None = None
-        super().__init__(*args, **kwargs)
+        super()._setup_model()
 
-    def _estimate(self, batch: EpisodeBatch, earlier: list[EpisodeBatch]) -> CurvatureEstimate:
+    def _update(self) -> None:
+        before = self.actor.vector
+        super()._update()
+        assert self.last_update is not None
+        accepted = self.last_update.accepted
+        self._last_step = self.actor.vector - before if accepted else None
+        self.records[-1] |= {
+            "length": (2.0 * self.last_update.kl_divergence) ** 0.5 if accepted else float("nan"),
+            "target_kl": self.last_update.target_kl,
+            "next_slope": float("nan"),
+        }
+
+    def _estimate(
+        self, batch: EpisodeBatch, joined: EpisodeBatch, earlier: list[EpisodeBatch]
+    ) -> CurvatureEstimate:
         folds = CrossFit(self, batch, earlier)
         self._record_next_slope(folds.fresh_gradient)
         record: Row = {"update": len(self.records), "timesteps": self.num_timesteps}
@@ -71,26 +83,13 @@ class ConfirmedCRPN(CRPN):
         for name in ("claimed_slope", "slope", "curvature"):
             record[name] = getattr(confirmed, name, float("nan"))
         self.records.append(record)
-        return super()._estimate(batch, earlier)
+        return super()._estimate(batch, joined, earlier)
 
     def _record_next_slope(self, gradient: Tensor) -> None:
         """Add to the last update what this rollout says of its step."""
         if self._last_step is not None:
             length = self.records[-1]["length"]
             self.records[-1]["next_slope"] = -float(gradient @ self._last_step) / length
-
-    def _take_step(
-        self, batch: EpisodeBatch, model: LocalModel, target_kl: float | None
-    ) -> PolicyStep:
-        before = self.actor.vector
-        step = super()._take_step(batch, model, target_kl)
-        self._last_step = None if step.rejected else self.actor.vector - before
-        self.records[-1] |= {
-            "length": float("nan") if step.rejected else (2.0 * step.trial.kl) ** 0.5,
-            "target_kl": target_kl,
-            "next_slope": float("nan"),
-        }
-        return step
 
 
 def parabola_kl(slope: float, curvature: float) -> float:

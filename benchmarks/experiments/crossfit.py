@@ -21,7 +21,7 @@ from benchmarks.experiments.steps import (
     n_steps,
 )
 from sb3_crpn import CRPN
-from sb3_crpn.curvature import PairWeights
+from sb3_crpn.curvature import HESSIAN_ESTIMATORS
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from sb3_crpn.episodes import EpisodeBatch, concatenate
 
@@ -72,10 +72,10 @@ class CrossFit:
         earlier: list[EpisodeBatch],
         n_folds: int = N_FOLDS,
     ) -> None:
-        weights = PairWeights(model.hessian_estimator, model.hessian_lambda)
+        estimator = HESSIAN_ESTIMATORS.resolve(model.hessian_estimator, model)
 
         def derivatives(batch: EpisodeBatch) -> EpisodeDerivatives:
-            return EpisodeDerivatives(model.policy, model.actor, batch, weights)
+            return EpisodeDerivatives(model.policy, model.actor, batch, estimator)
 
         self._damping = model.fisher_damping
         self._fisher = [derivatives(fresh)]  # one graph: products with few steps are slow

@@ -36,9 +36,8 @@ from benchmarks.experiments.steps import (
 from benchmarks.experiments.study import PALETTE, Row, Study, interval
 from benchmarks.experiments.tasks import make_model
 from sb3_crpn import CRPN
-from sb3_crpn.curvature import PairWeights
+from sb3_crpn.curvature import HESSIAN_ESTIMATORS, JamesStein
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives
-from sb3_crpn.curvature.local_model import james_stein
 from sb3_crpn.episodes import EpisodeBatch
 
 # Timesteps after which learning is under way and far from done
@@ -73,10 +72,10 @@ def judge_steps(model: CRPN, per_batch: int, rng: np.random.Generator) -> list[R
     """Make steps from batches of ``per_batch`` fresh episodes, and judge them by other batches."""
     batches = model.estimate_curvature(N_BATCHES * per_batch).gradient_batch.split(N_BATCHES)
     model.policy.set_training_mode(False)
-    weights = PairWeights(model.hessian_estimator, model.hessian_lambda)
+    estimator = HESSIAN_ESTIMATORS.resolve(model.hessian_estimator, model)
 
     def derivatives(batch: EpisodeBatch) -> EpisodeDerivatives:
-        return EpisodeDerivatives(model.policy, model.actor, batch, weights)
+        return EpisodeDerivatives(model.policy, model.actor, batch, estimator)
 
     groups = [derivatives(batch) for batch in batches]
     sizes, gradients = n_steps(groups), gradient_sums(groups)
@@ -109,7 +108,7 @@ def _shrinkage(halves: list[EpisodeDerivatives], space: Subspace) -> float:
     """Return CRPN's factor ω."""
     sizes = n_steps(halves)
     forms = hessian_sums(halves, space.basis) / sizes[:, None, None]
-    return james_stein(forms, sizes / sizes.sum())
+    return JamesStein().factor(forms, sizes / sizes.sum())
 
 
 def _hessians(

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 import torch
+from gymnasium import Env
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
 from benchmarks.experiments.crossfit import CrossFit, Fold
 from benchmarks.experiments.steps import step_of_kl
 from sb3_crpn import CRPN
-from sb3_crpn.curvature import CurvatureEstimate
-from sb3_crpn.episodes import EpisodeBatch, concatenate
+from sb3_crpn.curvature import HESSIAN_ESTIMATORS, CurvatureEstimate, estimate_curvature
+from sb3_crpn.episodes import EpisodeBatch
 
 MAX_ORACLE_ENVS = 16
 # ω from which the held-out value chooses
@@ -21,35 +25,49 @@ OMEGAS = (0.0, 0.25, 0.5, 0.75, 1.0)
 MEMORY = 0.9  # by which the values of the past fade in an update
 
 
-class OracleHessian(CRPN):
-    """H from ``oracle_factor`` times as many fresh, independent episodes as the rollout has.
+class FreshHessian(CRPN):
+    """H from the fresh rollout alone, g from the earlier ones too."""
+
+    def _estimate(
+        self, batch: EpisodeBatch, joined: EpisodeBatch, earlier: list[EpisodeBatch]
+    ) -> CurvatureEstimate:
+        return estimate_curvature(
+            self.policy,
+            self.actor,
+            joined,
+            HESSIAN_ESTIMATORS.resolve(self.hessian_estimator, self),
+            hessian_batch=self._hessian_batch(batch),
+            fisher_batch=batch,
+        )
+
+    def _hessian_batch(self, batch: EpisodeBatch) -> EpisodeBatch:
+        return batch
+
+
+class OracleHessian(FreshHessian):
+    """H from ``factor`` times as many fresh, independent episodes as the rollout has.
 
     They are simulated in environments of their own, and counted nowhere: what a better estimate of
     H would be worth, not a method. For environments without ``VecNormalize``.
 
-    Parameters
+    Attributes
     ----------
-    env_id, oracle_factor
-        The environment's registered name, and the factor.
+    factor
+        The factor.
+    env_id
+        The environment's registered name, or a function that makes it.
     """
 
-    def __init__(self, *args: Any, env_id: str, oracle_factor: int, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self._factor = oracle_factor
-        self._oracle_env = make_vec_env(env_id, MAX_ORACLE_ENVS, seed=1000 + (self.seed or 0))
+    factor: int
+    env_id: str | Callable[[], Env[Any, Any]]
 
-    def _estimate(self, batch: EpisodeBatch, earlier: list[EpisodeBatch]) -> CurvatureEstimate:
-        fresh = self._collect_fresh(self._factor * batch.n_episodes, self._oracle_env)
-        return self._estimate_from(
-            concatenate([batch, *earlier]), self._episode_batch(fresh), batch
-        )
+    @cached_property
+    def _oracle_env(self) -> VecEnv:
+        return make_vec_env(self.env_id, MAX_ORACLE_ENVS, seed=1000 + (self.seed or 0))
 
-
-class FreshHessian(CRPN):
-    """H from the fresh rollout alone, g from the earlier ones too."""
-
-    def _estimate(self, batch: EpisodeBatch, earlier: list[EpisodeBatch]) -> CurvatureEstimate:
-        return self._estimate_from(concatenate([batch, *earlier]), batch, batch)
+    def _hessian_batch(self, batch: EpisodeBatch) -> EpisodeBatch:
+        n_episodes = self.factor * batch.n_episodes
+        return self._episode_batch(self._collect_evaluation_episodes(n_episodes, self._oracle_env))
 
 
 class ConfirmedHessian(CRPN):
@@ -66,19 +84,25 @@ class ConfirmedHessian(CRPN):
         The (source, ω) of the last update.
     """
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def _setup_model(self) -> None:
         self.values: dict[tuple[str, float], float] = {}
         self.choice = ("all", 0.0)
-        super().__init__(*args, **kwargs)
+        super()._setup_model()
 
-    def _estimate(self, batch: EpisodeBatch, earlier: list[EpisodeBatch]) -> CurvatureEstimate:
+    def _estimate(
+        self, batch: EpisodeBatch, joined: EpisodeBatch, earlier: list[EpisodeBatch]
+    ) -> CurvatureEstimate:
         if batch.n_episodes > 1:
             self._judge(CrossFit(self, batch, earlier))
             self.choice = max(self.values, key=self.values.__getitem__)
         source, self.hessian_shrinkage = self.choice
-        gradient_batch = concatenate([batch, *earlier])
-        return self._estimate_from(
-            gradient_batch, gradient_batch if source == "all" else batch, batch
+        return estimate_curvature(
+            self.policy,
+            self.actor,
+            joined,
+            HESSIAN_ESTIMATORS.resolve(self.hessian_estimator, self),
+            hessian_batch=None if source == "all" else batch,
+            fisher_batch=batch,
         )
 
     def _judge(self, folds: CrossFit) -> None:

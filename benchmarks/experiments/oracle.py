@@ -52,8 +52,9 @@ def measure(env: str, target_kl: float, hessian: str, seed: int) -> list[Row]:
         arguments["hessian_shrinkage"] = 0.0
     elif hessian.isdecimal():
         algorithm = OracleHessian
-        arguments |= {"env_id": env, "oracle_factor": int(hessian)}
     model = make_model(env, seed, algorithm, **arguments)
+    if isinstance(model, OracleHessian):
+        model.factor, model.env_id = int(hessian), env
     returns = Returns(BUDGETS[env])
     model.learn(BUDGETS[env], callback=returns)
     return [returns.summary()]

@@ -43,12 +43,12 @@ def n_steps(groups: Sequence[EpisodeDerivatives]) -> Tensor:
 
 def gradient_sums(groups: Sequence[EpisodeDerivatives]) -> Tensor:
     """Return Σ_i A_i σ_i over the steps of each group, [K, d]."""
-    return torch.stack([group.gradient() * group.batch.n_episodes for group in groups])
+    return torch.stack([group.gradient() * group.batch.size for group in groups])
 
 
 def hessian_sums(groups: Sequence[EpisodeDerivatives], basis: Tensor) -> Tensor:
     """Return VᵀHV of each group for V = ``basis``, summed over its steps, [K, k, k]."""
-    forms = [group.quadratic_form(basis) * group.batch.n_episodes for group in groups]
+    forms = [group.quadratic_form(basis) * group.batch.size for group in groups]
     stacked = torch.stack(forms)
     return 0.5 * (stacked + stacked.transpose(1, 2))
 
@@ -58,16 +58,13 @@ def fisher_subspace(
 ) -> Subspace:
     """Return K(F, g) with F from the states of all ``groups``."""
     shares = n_steps(groups) / n_steps(groups).sum()
-    columns: list[Tensor] = []
 
     def product(vector: Tensor) -> Tensor:
-        columns.append(
-            sum(w * g.fisher_product(vector) for w, g in zip(shares, groups, strict=True))
-        )
-        return columns[-1]
+        parts = torch.stack([group.fisher_product(vector) for group in groups])
+        return shares @ parts
 
-    basis = krylov_basis(product, gradient, dim)
-    fisher = basis.T @ torch.stack(columns, dim=1)
+    basis, products = krylov_basis(product, gradient, dim)
+    fisher = basis.T @ products
     eigenvalues, vectors = torch.linalg.eigh(0.5 * (fisher + fisher.T))
     eigenvalues = eigenvalues.clamp(min=0.0)
     metric = eigenvalues + damping

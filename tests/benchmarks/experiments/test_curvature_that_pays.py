@@ -28,8 +28,9 @@ from benchmarks.experiments.hessians import ConfirmedHessian, FreshHessian, Orac
 from benchmarks.experiments.steps import Subspace, fisher_subspace, step_of_kl
 from benchmarks.learning.store import RESULTS, read_curves
 from sb3_crpn import CRPN, PAPER
-from sb3_crpn.curvature import PairWeights
+from sb3_crpn.curvature import Causal
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives
+from sb3_crpn.episodes import concatenate
 from sb3_crpn.vec_env import GymnasiumVecEnv
 
 KAPPA = 0.9
@@ -105,7 +106,7 @@ def test_a_newton_step_within_the_divergence_is_taken():
 def test_the_subspace_whitens_the_damped_fisher_matrix():
     model = make_learner()
     batch = model.estimate_curvature(4).gradient_batch
-    group = EpisodeDerivatives(model.policy, model.actor, batch, PairWeights("causal", KAPPA))
+    group = EpisodeDerivatives(model.policy, model.actor, batch, Causal(KAPPA))
     dense = torch.stack([group.fisher_product(e) for e in torch.eye(len(THETA)).double()])
     space = fisher_subspace([group], group.gradient(), 0.1, dim=3)
     identity = space.basis.T @ (dense @ space.basis + 0.1 * space.basis)
@@ -197,12 +198,13 @@ def test_the_oracle_knows_the_hessian_better():
     _, exact, _ = exact_derivatives()
     errors = {}
     for factor in (1, 16):
-        model = make_learner(OracleHessian, env_id=lambda: TabularEnv(MDP), oracle_factor=factor)
+        model = make_learner(OracleHessian)
+        model.factor, model.env_id = factor, lambda: TabularEnv(MDP)
         deviations = []
         for _ in range(8):
             batch = model.estimate_curvature(16).gradient_batch
             before = model.num_timesteps
-            estimate = model._estimate(batch, [])
+            estimate = model._estimate(batch, batch, [])
             assert model.num_timesteps == before
             dense = estimate.hessian @ torch.eye(len(THETA)).double() / MDP.horizon
             deviations.append(float((dense - exact).norm()) ** 2)
@@ -213,9 +215,9 @@ def test_the_oracle_knows_the_hessian_better():
 def test_the_fresh_hessian_forgets_earlier_rollouts_and_the_gradient_does_not():
     model = make_learner(FreshHessian)
     batch, earlier = (model.estimate_curvature(6).gradient_batch for _ in range(2))
-    estimate = model._estimate(batch, [earlier])
+    estimate = model._estimate(batch, concatenate([batch, earlier]), [earlier])
     direction = torch.ones(len(THETA), dtype=torch.float64)
-    alone = model._estimate_from(batch, batch)
+    alone = model._estimate(batch, batch, [])
     assert torch.allclose(estimate.hessian @ direction, alone.hessian @ direction)
     assert not torch.allclose(estimate.gradient, alone.gradient)
 
@@ -224,7 +226,7 @@ def test_a_choice_of_the_hessian_has_the_value_of_its_step():
     space, g, H = exact_model()
     model = make_learner(ConfirmedHessian, n_envs=100, target_kl=0.1)
     batch, earlier = (model.estimate_curvature(4000).gradient_batch for _ in range(2))
-    model._estimate(batch, [earlier])
+    model._estimate(batch, concatenate([batch, earlier]), [earlier])
     assert len(model.values) == 10
     for (_, omega), value in model.values.items():
         y = step_of_kl(g, omega * H, space, 0.1)
@@ -235,7 +237,8 @@ def test_a_choice_of_the_hessian_has_the_value_of_its_step():
 
 def test_what_one_episode_says_of_the_hessian_is_not_believed():
     model = make_learner(ConfirmedHessian)
-    model._estimate(model.estimate_curvature(1).gradient_batch, [])
+    batch = model.estimate_curvature(1).gradient_batch
+    model._estimate(batch, batch, [])
     assert model.choice == ("all", 0.0)
 
 
@@ -250,7 +253,9 @@ def test_runs_of_the_oracle_study_differ_in_the_hessian_alone(monkeypatch):
 
 
 def test_targets_follow_what_is_confirmed():
-    model = make_learner(AutoKL, fraction=0.5).learn(MDP.horizon * 8 * 6)
+    model = make_learner(AutoKL)
+    model.fraction = 0.5
+    model.learn(MDP.horizon * 8 * 6)
     records = pd.DataFrame(model.records)
     targets = [0.02]
     for k in range(1, len(records)):
