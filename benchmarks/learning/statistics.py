@@ -8,47 +8,13 @@ are; every environment weighs the same here, however many seeds it has.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 
-CONFIDENCE = 0.95
-N_RESAMPLES = 2000
+from benchmarks.common.intervals import CONFIDENCE, N_RESAMPLES, Estimate
 
 Array = npt.NDArray[np.float64]
-
-
-class Estimate(NamedTuple):
-    """A statistic, a float or an array, and the bounds of its interval."""
-
-    value: Any
-    low: Any
-    high: Any
-
-
-def bootstrap(
-    values: Array, statistic: Callable[..., float] = np.mean, method: str = "BCa"
-) -> Estimate:
-    """Return a statistic of independent runs with its bootstrap interval.
-
-    One run alone has none (NaN); equal ones have one of width 0.
-    """
-    value = float(statistic(values))
-    if len(values) < 2:
-        return Estimate(value, float("nan"), float("nan"))
-    if np.ptp(values) == 0:
-        return Estimate(value, value, value)
-    bounds = stats.bootstrap(
-        (values,),
-        statistic,
-        n_resamples=N_RESAMPLES,
-        confidence_level=CONFIDENCE,
-        method=method,
-        rng=np.random.default_rng(0),
-    ).confidence_interval
-    return Estimate(value, float(bounds.low), float(bounds.high))
 
 
 def stratified_bootstrap(

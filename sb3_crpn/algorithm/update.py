@@ -121,13 +121,7 @@ class PolicyNewtonUpdate(RolloutAlgorithm):
         env = (_VEC_ENV | NONE)("estimate_curvature: env", env)
         share_policy(self.policy)
         batch = self._episode_batch(self._collect_evaluation_episodes(n_episodes, env))
-        return estimate_curvature(
-            self.policy,
-            self.actor,
-            batch,
-            HESSIAN_ESTIMATORS.resolve(self.hessian_estimator, self),
-            max_steps=self.max_batch_timesteps,
-        )
+        return self._estimate_from(batch)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         """Keep the progress of schedules in [0, 1]: whole episodes overrun the last timestep."""
@@ -175,14 +169,22 @@ class PolicyNewtonUpdate(RolloutAlgorithm):
             hessian_batch = concatenate([self._draw(batch, b), *earlier])
         elif b is not None and drawn is not batch:
             hessian_batch = joined
+        return self._estimate_from(
+            joined if drawn is batch else concatenate([drawn, *earlier]),
+            hessian_batch=hessian_batch,
+            fisher_batch=drawn if earlier else None,
+        )
+
+    def _estimate_from(
+        self, batch: EpisodeBatch, **others: EpisodeBatch | None
+    ) -> CurvatureEstimate:
         return estimate_curvature(
             self.policy,
             self.actor,
-            joined if drawn is batch else concatenate([drawn, *earlier]),
+            batch,
             HESSIAN_ESTIMATORS.resolve(self.hessian_estimator, self),
-            hessian_batch=hessian_batch,
-            fisher_batch=drawn if earlier else None,
             max_steps=self.max_batch_timesteps,
+            **others,
         )
 
     def _draw(self, batch: EpisodeBatch, n_episodes: int) -> EpisodeBatch:

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import warnings
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -10,12 +11,14 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from benchmarks.learning import comparison, report, store, tables
+from benchmarks.common.intervals import interval
+from benchmarks.learning import comparison, equal, report, store, tables
 from benchmarks.learning.__main__ import main
 from benchmarks.learning.run import N_BINS, Result, Run, learning_curve
 from benchmarks.learning.settings import (
     ALGORITHMS,
     BUDGETS,
+    TRPO_EQUAL,
     describe,
     find_entry,
     parse_setting,
@@ -24,7 +27,6 @@ from benchmarks.learning.settings import (
     setting_label,
 )
 from benchmarks.learning.statistics import (
-    bootstrap,
     improvement,
     interquartile_mean,
     performance_profile,
@@ -125,6 +127,34 @@ def test_reinforce_has_crpns_entry_without_what_only_newton_steps_use() -> None:
     assert "actor_learning_rate=" in describe("REINFORCE", reinforce)
 
 
+def test_trpo_at_equal_settings_has_crpns_entry_and_defaults() -> None:
+    entry, arguments = resolve(TRPO_EQUAL, "CartPole-v1", {})
+    assert entry == "crpn.yml: CartPole-v1"
+    crpn = describe("CRPN", resolve("CRPN", "CartPole-v1", {})[1])
+    trpo = describe(TRPO_EQUAL, arguments)
+    assert same_hyperparameters(crpn, trpo)
+    shared = ("n_envs", "n_steps", "gamma", "gae_lambda", "target_kl", "normalize", "batch_size",
+              "n_critic_updates", "learning_rate", "policy_kwargs", "use_sde")  # fmt: skip
+    assert all(f"{name}=" in crpn and f"{name}=" in trpo for name in shared)
+    assert "krylov_dim" not in trpo
+    # episodes of 1,000 steps: as many in an update of CRPN
+    assert resolve("CRPN", "HalfCheetah-v5", {})[1]["n_steps"] == 512
+    assert resolve(TRPO_EQUAL, "HalfCheetah-v5", {})[1]["n_steps"] == 1000
+
+
+def test_the_arms_at_equal_settings() -> None:
+    runs = list(equal.wanted_runs(["CartPole-v1", "Walker2d-v5"]))
+    arms = {(run.env, run.algo, run.setting) for run in runs}
+    without = "hessian_shrinkage=0.0"
+    cartpole = {("CRPN", ""), ("CRPN", without), ("ACRPN", ""), (TRPO_EQUAL, "")}
+    # Walker2d's entry has no Hessian: the same run
+    expected = {("CartPole-v1", *arm) for arm in cartpole}
+    expected |= {("Walker2d-v5", *arm) for arm in cartpole - {("CRPN", without)}}
+    assert arms == expected
+    assert len(runs) == 4 * 10 + 3 * 5
+    assert sorted(env for stage, _ in equal.STAGES for env in stage) == sorted(BUDGETS)
+
+
 def test_a_new_argument_does_not_make_another_run_but_another_value_does() -> None:
     assert same_hyperparameters("a=1; b=2", "a=1; b=2; c=3")
     assert not same_hyperparameters("a=1; b=2", "a=1; b=3")
@@ -137,7 +167,7 @@ def _run(algo: str, seed: int, hyperparameters: str = "a=1", env: str = "CartPol
 
 def _result(mean: float, curve: np.ndarray) -> Result:
     row = {"mean_return": mean, "final_return": 2 * mean, "steps": 100_000, "episodes": 9,
-           "wall_seconds": 3.0, "cpu_seconds": 2.0, "versions": ""}  # fmt: skip
+           "updates": 3, "wall_seconds": 3.0, "cpu_seconds": 2.0, "versions": ""}  # fmt: skip
     steps = np.linspace(0, 100_000, len(curve) + 1)[1:]
     return Result(row, [(int(s), float(v)) for s, v in zip(steps, curve, strict=True)])
 
@@ -239,18 +269,32 @@ def test_performance_profile_is_a_fraction_of_runs() -> None:
     np.testing.assert_allclose(profile, [1, 0.75, 0])
 
 
-def test_intervals() -> None:
+def test_stratified_intervals_of_one_environment_are_plain_ones() -> None:
     values = np.random.default_rng(2).normal(size=400)
-    mean, low, high = bootstrap(values)
-    assert low < mean < high
-    assert high - low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.1)
-    assert stratified_bootstrap([values], lambda s: float(s[0].mean())) == pytest.approx(
-        (mean, low, high), abs=0.01
-    )
-    assert bootstrap(np.full(3, 5.0)) == (5, 5, 5)
-    alone = bootstrap(np.array([5.0]))
-    assert alone.value == 5
-    assert np.isnan(alone.low)
+    found = stratified_bootstrap([values], lambda s: float(s[0].mean()))
+    assert found == pytest.approx(interval(values), abs=0.01)
+
+
+@pytest.mark.skipif(find_spec("rliable") is None, reason="needs the zoo extra")
+def test_statistics_are_rliables() -> None:
+    from rliable import library, metrics
+
+    rng = np.random.default_rng(0)
+    scores, others = rng.normal(size=(2, 10, 8)), rng.normal(0.3, 1, size=(10, 8))
+    ours = list(scores[0].T)
+    assert interquartile_mean(ours) == pytest.approx(metrics.aggregate_iqm(scores[0]))
+    expected = metrics.probability_of_improvement(scores[0], others)
+    assert improvement(ours, list(others.T)).value == pytest.approx(expected)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # of how it calls its own bootstrap
+        _, bounds = library.get_interval_estimates(
+            {"a": scores[0]},
+            lambda x: np.array([metrics.aggregate_iqm(x)]),
+            reps=2000,
+            random_state=np.random.RandomState(0),
+        )
+    _, low, high = stratified_bootstrap(ours, interquartile_mean)
+    assert (low, high) == pytest.approx(tuple(bounds["a"].ravel()), abs=0.03)
 
 
 @needs_zoo
@@ -267,6 +311,7 @@ def test_command_runs_resumes_and_reports(
     runs = store.read_runs(tmp_path).set_index("algo")
     assert runs.steps[["CRPN", "TRPO"]].eq(1200).all()
     assert runs.mean_return.between(9, 500).all()
+    assert runs.updates["TRPO"] == 1  # of 2 × 512 steps
     assert runs.entry["TRPO"] == "trpo.yml: CartPole-v1"
     assert set(store.read_curves(tmp_path).algo) == {"CRPN", "TRPO"}
 
