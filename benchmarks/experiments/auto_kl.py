@@ -24,8 +24,13 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchmarks.experiments.confirmed import ConfirmedCRPN, parabola_kl
-from benchmarks.experiments.study import PALETTE, Row, Study, interval
+from benchmarks.common.figures import PALETTE
+from benchmarks.common.intervals import interval
+from benchmarks.common.markdown import estimate, markdown
+from benchmarks.common.table import Row
+from benchmarks.experiments.confirmed import ConfirmedCRPN
+from benchmarks.experiments.steps import parabola_kl
+from benchmarks.experiments.study import Study
 from benchmarks.experiments.tasks import Returns, make_model
 from benchmarks.learning.settings import resolve
 from benchmarks.learning.store import RESULTS, read_curves
@@ -116,31 +121,25 @@ def entry_rows(env: str, seeds: Sequence[int]) -> list[Row]:
 
 def table(rows: pd.DataFrame) -> str:
     """Return a Markdown table: means over seeds with intervals."""
-    lines = [
-        "| task | target | mean return | of the last fifth | median target |",
-        "|---" * 5 + "|",
-    ]
+    body = []
     for (env, arm), group in rows.groupby(["env", "arm"], sort=False):
-        cells = [
-            "{:.0f} [{:.0f}, {:.0f}]".format(*interval(group[name], statistic=np.mean))
-            for name in ("mean_return", "late_return")
-        ]
-        target = f"{group.median_target_kl.median():.3f}"
-        lines.append(f"| {env} | {arm} | {' | '.join(cells)} | {target} |")
-    return "\n".join(lines)
+        means = [estimate(interval(group[key]), ".0f") for key in ("mean_return", "late_return")]
+        body.append([env, arm, len(group), *means, f"{group.median_target_kl.median():.3f}"])
+    head = ["task", "target_kl", "seeds", "mean return", "of the last fifth", "median target"]
+    return markdown(head, body)
 
 
 def draw(rows: pd.DataFrame) -> Figure:
     """Draw the mean returns, a panel a task; print the table."""
-    seeds = sorted(rows.seed.unique())
-    entries = pd.DataFrame([row for env in ENVS for row in entry_rows(env, seeds)])
-    rows = pd.concat([entries, rows], ignore_index=True).sort_values("env", kind="stable")
+    envs = [env for env in ENVS if env in set(rows.env)]
+    entries = [pd.DataFrame(entry_rows(env, list(rows[rows.env == env].seed))) for env in envs]
+    rows = pd.concat([*entries, rows], ignore_index=True).sort_values("env", kind="stable")
     print(table(rows))
-    figure, axes = plt.subplots(1, len(ENVS), figsize=(9, 2.8), layout="constrained")
-    for axis, env in zip(axes, ENVS, strict=True):
+    figure, axes = plt.subplots(1, len(envs), figsize=(3 * len(envs), 2.8), layout="constrained")
+    for axis, env in zip(np.atleast_1d(axes), envs, strict=True):
         _draw_means(axis, rows[rows.env == env])
         axis.set_title(env, fontsize=9)
-    axes[0].set_ylabel("mean return over training")
+    np.atleast_1d(axes)[0].set_ylabel("mean return over training")
     return figure
 
 
@@ -148,7 +147,7 @@ def _draw_means(axis: Axes, rows: pd.DataFrame) -> None:
     arms = list(rows.arm.unique())
     for position, (colour, arm) in enumerate(zip(PALETTE, arms, strict=False)):
         values = rows[rows.arm == arm].mean_return
-        mean, low, high = interval(values, statistic=np.mean)
+        mean, low, high = interval(values)
         axis.errorbar(position, mean, [[mean - low], [high - mean]], fmt="o", color=colour)
         axis.plot(np.full(len(values), position), values, ".", ms=3, color=colour, alpha=0.4)
     axis.set_xticks(range(len(arms)), arms, fontsize=7)

@@ -15,16 +15,18 @@ least, to second order. It is compared with the entry's ``target_kl``, chosen by
 
 from __future__ import annotations
 
-import math
-
 import matplotlib.pyplot as plt
-import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from benchmarks.common.figures import PALETTE
+from benchmarks.common.intervals import interval
+from benchmarks.common.markdown import estimate, markdown
+from benchmarks.common.table import Row
 from benchmarks.experiments.crossfit import CrossFit, confirm_natural_step
-from benchmarks.experiments.study import PALETTE, Row, Study, interval
+from benchmarks.experiments.steps import parabola_kl
+from benchmarks.experiments.study import Study
 from benchmarks.experiments.tasks import Returns, make_model
 from sb3_crpn import CRPN
 from sb3_crpn.curvature import CurvatureEstimate
@@ -92,13 +94,6 @@ class ConfirmedCRPN(CRPN):
             self.records[-1]["next_slope"] = -float(gradient @ self._last_step) / length
 
 
-def parabola_kl(slope: float, curvature: float) -> float:
-    """Return ½ (slope/curvature)²; 0 where the cost does not fall, ∞ where it only falls."""
-    if slope <= 0.0:
-        return 0.0
-    return 0.5 * (slope / curvature) ** 2 if curvature > 0.0 else math.inf
-
-
 def secant_curvature(rows: pd.DataFrame) -> float:
     """Return the curvature that the next rollouts' slopes speak of, by least squares."""
     drop = rows.slope - rows.next_slope
@@ -107,32 +102,27 @@ def secant_curvature(rows: pd.DataFrame) -> float:
 
 def table(rows: pd.DataFrame) -> str:
     """Return a Markdown table, a row per task and third of training; means over updates, seeds."""
-    lines = [
-        "| task | entry's target_kl | third | share of slope confirmed | slope "
-        "| curvature, cross-fitted | its KL | curvature, secant | its KL |",
-        "|---" * 9 + "|",
-    ]
+    body = []
     for env, group in rows.groupby("env", sort=False):
         third = (3 * group.timesteps / (BUDGET + 1)).astype(int).clip(upper=2)
         for part, chosen in group.groupby(third):
-            share = chosen.slope.mean() / chosen.claimed_slope.mean()
-            cells = [
-                str(env),
-                f"{group.target_kl.max():g}",
-                f"{part + 1}",
-                f"{share:.2f}",
-                _mean(chosen, "slope"),
-                _mean(chosen, "curvature"),
-                f"{parabola_kl(chosen.slope.mean(), chosen.curvature.mean()):.3f}",
-                f"{secant_curvature(chosen):.3f}",
-                f"{parabola_kl(chosen.slope.mean(), secant_curvature(chosen)):.3f}",
-            ]
-            lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def _mean(rows: pd.DataFrame, name: str) -> str:
-    return "{:.3f} [{:.3f}, {:.3f}]".format(*interval(rows[name].dropna(), statistic=np.mean))
+            slope, secant = chosen.slope.mean(), secant_curvature(chosen)
+            body.append(
+                [
+                    env,
+                    f"{group.target_kl.max():g}",
+                    part + 1,
+                    f"{slope / chosen.claimed_slope.mean():.2f}",
+                    estimate(interval(chosen.slope.dropna()), ".3f"),
+                    estimate(interval(chosen.curvature.dropna()), ".2f"),
+                    f"{parabola_kl(slope, chosen.curvature.mean()):.3f}",
+                    f"{secant:.2f}",
+                    f"{parabola_kl(slope, secant):.3f}",
+                ]
+            )
+    head = ["task", "entry's target_kl", "third", "share of slope confirmed", "slope",
+            "curvature, cross-fitted", "its KL", "curvature, secant", "its KL"]  # fmt: skip
+    return markdown(head, body)
 
 
 def draw(rows: pd.DataFrame) -> Figure:

@@ -25,15 +25,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from benchmarks.common.figures import PALETTE
+from benchmarks.common.intervals import interval
+from benchmarks.common.markdown import estimate, markdown
+from benchmarks.common.table import Row
 from benchmarks.experiments.steps import (
     Subspace,
     fisher_subspace,
     gradient_sums,
     hessian_sums,
     n_steps,
+    parabola_kl,
     step_of_kl,
 )
-from benchmarks.experiments.study import PALETTE, Row, Study, interval
+from benchmarks.experiments.study import Study
 from benchmarks.experiments.tasks import make_model
 from sb3_crpn import CRPN
 from sb3_crpn.curvature import HESSIAN_ESTIMATORS, JamesStein
@@ -152,31 +157,27 @@ class _Judges:
 
 def table(rows: pd.DataFrame) -> str:
     """Return two Markdown tables: what H = 0's step is, and the gains of the others beside it."""
-    lines = [
-        "| task | share of the slope confirmed | curvature, own batch | test | "
-        "½ (slope / curvature)² |",
-        "|---|---|---|---|---|",
-    ]
-    first = rows[(rows.hessian == "none") & (rows.kl == KLS[0])]
-    for env, group in first.groupby("env", sort=False):
-        slope, curvature = group.test_slope.mean(), group.test_curvature.mean()
-        length = f"{0.5 * (slope / curvature) ** 2:.3f}" if curvature > 0 else "∞"
-        share = slope / group.own_slope.mean()
-        own = group.own_curvature.mean()
-        lines.append(f"| {env} | {share:.2f} | {own:.2f} | {curvature:.2f} | {length} |")
-    lines += ["", "| task | KL | gain of H = 0, 10⁻³ | " + " | ".join(HESSIANS[1:]) + " |"]
-    lines.append("|---" * (len(HESSIANS) + 2) + "|")
+    shortest = rows[(rows.hessian == "none") & (rows.kl == KLS[0])]
+    natural = [_confirmed(str(env), group) for env, group in shortest.groupby("env", sort=False)]
+    gains = []
     for (env, kl), group in rows.groupby(["env", "kl"], sort=False):
-        gains = group.pivot_table("test_gain", ["seed", "trial"], "hessian")
-        cells = [_difference(gains, name) for name in HESSIANS[1:]]
-        lines.append(f"| {env} | {kl:g} | {1e3 * gains['none'].mean():.1f} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        table = 1e3 * group.pivot_table("test_gain", ["seed", "trial"], "hessian")
+        cells = [estimate(interval(table[name] - table["none"]), "+.1f") for name in HESSIANS[1:]]
+        gains.append([env, f"{kl:g}", f"{table['none'].mean():.1f}", *cells])
+    head = ["task", "share of slope confirmed", "curvature, own batch", "others", "best KL"]
+    return (
+        markdown(head, natural)
+        + "\n\n"
+        + markdown(["task", "KL", "gain of H = 0, 10⁻³", *HESSIANS[1:]], gains)
+    )
 
 
-def _difference(gains: pd.DataFrame, name: str) -> str:
-    """Return a Hessian's gain less H = 0's, 10⁻³: mean over seeds, and its interval over trials."""
-    difference = 1e3 * (gains[name] - gains["none"])
-    return "{:+.1f} [{:+.1f}, {:+.1f}]".format(*interval(difference, statistic=np.mean))
+def _confirmed(env: str, rows: pd.DataFrame) -> list[str]:
+    """Return what the test says of the natural-gradient steps, and ½ (slope/curvature)²."""
+    slope, curvature = rows.test_slope.mean(), rows.test_curvature.mean()
+    share = slope / rows.own_slope.mean()
+    numbers = [share, rows.own_curvature.mean(), curvature]
+    return [env, *(f"{x:.2f}" for x in numbers), f"{parabola_kl(slope, curvature):.3f}"]
 
 
 def draw(rows: pd.DataFrame) -> Figure:

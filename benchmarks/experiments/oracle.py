@@ -25,8 +25,12 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from benchmarks.common.figures import PALETTE
+from benchmarks.common.intervals import interval
+from benchmarks.common.markdown import estimate, markdown
+from benchmarks.common.table import Row
 from benchmarks.experiments.hessians import ConfirmedHessian, FreshHessian, OracleHessian
-from benchmarks.experiments.study import PALETTE, Row, Study, interval
+from benchmarks.experiments.study import Study
 from benchmarks.experiments.tasks import Returns, make_model
 from sb3_crpn import CRPN
 
@@ -61,18 +65,14 @@ def measure(env: str, target_kl: float, hessian: str, seed: int) -> list[Row]:
 
 
 def table(rows: pd.DataFrame) -> str:
-    """Return a Markdown table of the mean return, and of its difference to H = 0."""
-    lines = [f"| task | target_kl | {' | '.join(HESSIANS)} |", "|---" * (len(HESSIANS) + 2) + "|"]
+    """Return a Markdown table of the mean returns, a row per task and target."""
+    names = [name for name in HESSIANS if name in set(rows.hessian)]
+    body = []
     for (env, kl), group in rows.groupby(["env", "target_kl"], sort=False):
-        means = group.pivot_table("mean_return", "seed", "hessian")
-        cells = [
-            "{:.0f} [{:.0f}, {:.0f}]".format(*interval(means[name].dropna(), statistic=np.mean))
-            if name in means
-            else "-"
-            for name in HESSIANS
-        ]
-        lines.append(f"| {env} | {kl:g} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        runs = {name: group[group.hessian == name].mean_return for name in names}
+        cells = ["-" if run.empty else estimate(interval(run), ".0f") for run in runs.values()]
+        body.append([env, f"{kl:g}", group.seed.nunique(), *cells])
+    return markdown(["task", "target_kl", "seeds", *names], body)
 
 
 def draw(rows: pd.DataFrame) -> Figure:
@@ -94,7 +94,7 @@ def _draw_means(axis: Axes, rows: pd.DataFrame) -> None:
             values = rows[(rows.target_kl == kl) & (rows.hessian == name)].mean_return
             if values.empty:
                 continue
-            mean, low, high = interval(values, statistic=np.mean)
+            mean, low, high = interval(values)
             label = f"target_kl {kl:g}" if name == HESSIANS[0] else None
             axis.errorbar(
                 position, mean, [[mean - low], [high - mean]], fmt="o", color=colour, label=label

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -69,6 +70,13 @@ def fisher_subspace(
     eigenvalues = eigenvalues.clamp(min=0.0)
     metric = eigenvalues + damping
     return Subspace(basis @ vectors / metric.sqrt(), eigenvalues / metric)
+
+
+def parabola_kl(slope: float, curvature: float) -> float:
+    """Return ½ (slope/curvature)²; 0 where the cost does not fall, ∞ where it only falls."""
+    if slope <= 0.0:
+        return 0.0
+    return 0.5 * (slope / curvature) ** 2 if curvature > 0.0 else math.inf
 
 
 def step_of_kl(gradient: Tensor, hessian: Tensor, space: Subspace, kl: float) -> Tensor:

@@ -19,13 +19,12 @@ from benchmarks.experiments import auto_kl, heldout, oracle
 from benchmarks.experiments.auto_kl import AutoKL
 from benchmarks.experiments.confirmed import (
     ConfirmedCRPN,
-    parabola_kl,
     recommendations,
     secant_curvature,
 )
 from benchmarks.experiments.crossfit import CrossFit, confirm_natural_step
 from benchmarks.experiments.hessians import ConfirmedHessian, FreshHessian, OracleHessian
-from benchmarks.experiments.steps import Subspace, fisher_subspace, step_of_kl
+from benchmarks.experiments.steps import Subspace, fisher_subspace, parabola_kl, step_of_kl
 from benchmarks.learning.store import RESULTS, read_curves
 from sb3_crpn import CRPN, PAPER
 from sb3_crpn.curvature import Causal
