@@ -55,7 +55,7 @@ def sums(theta: Tensor, episodes: list[Episode], psi: list[Tensor]) -> tuple[Ten
     observations, actions = (torch.cat(part) for part in list(zip(*episodes, strict=True))[:2])
     weight, bias = split(theta, observations.shape[1])
     log_pi = torch.log_softmax(observations @ weight.T + bias, 1)[range(len(actions)), actions]
-    parts = log_pi.split([len(part) for part in psi])
+    parts = torch.split(log_pi, [len(part) for part in psi])
     phi = [part @ weights for part, weights in zip(parts, psi, strict=True)]
     return torch.stack(phi), torch.stack([part.sum() for part in parts])
 
@@ -65,9 +65,13 @@ def estimate(theta: Tensor, episodes: list[Episode], psi: list[Tensor]) -> tuple
     grad_phi, grad_log_p = jacrev(sums)(theta, episodes, psi)  # [m, d] each
     # Alg. 1: ḡ_k = (1/m_k) Σ_τ Σ_h Ψ_h(τ) ∇log π(a_h|s_h; θ_{k-1})
     g = grad_phi.mean(0)
+
     # Alg. 1: H̄_k = (1/b_k) Σ_τ (Σ_h Ψ_h(τ) ∇log π(a_h|s_h; θ_{k-1}) Σ_h' ∇ᵀlog π(a_h'|s_h'; …))
     #               + (1/b_k) Σ_τ Σ_h Ψ_h(τ) ∇²log π(a_h|s_h; θ_{k-1})
-    curvature = jacrev(grad(lambda at: sums(at, episodes, psi)[0].mean()))(theta)
+    def mean_phi(at: Tensor) -> Tensor:
+        return sums(at, episodes, psi)[0].mean()
+
+    curvature = jacrev(grad(mean_phi))(theta)
     H = grad_phi.T @ grad_log_p / len(episodes) + curvature
     return g, (H + H.T) / 2
 
