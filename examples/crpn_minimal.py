@@ -65,13 +65,9 @@ def estimate(theta: Tensor, episodes: list[Episode], psi: list[Tensor]) -> tuple
     grad_phi, grad_log_p = jacrev(sums)(theta, episodes, psi)  # [m, d] each
     # Alg. 1: ḡ_k = (1/m_k) Σ_τ Σ_h Ψ_h(τ) ∇log π(a_h|s_h; θ_{k-1})
     g = grad_phi.mean(0)
-
     # Alg. 1: H̄_k = (1/b_k) Σ_τ (Σ_h Ψ_h(τ) ∇log π(a_h|s_h; θ_{k-1}) Σ_h' ∇ᵀlog π(a_h'|s_h'; …))
     #               + (1/b_k) Σ_τ Σ_h Ψ_h(τ) ∇²log π(a_h|s_h; θ_{k-1})
-    def mean_phi(at: Tensor) -> Tensor:
-        return sums(at, episodes, psi)[0].mean()
-
-    curvature = jacrev(grad(mean_phi))(theta)
+    curvature = jacrev(grad(lambda at: sums(at, episodes, psi)[0].mean()))(theta)
     H = grad_phi.T @ grad_log_p / len(episodes) + curvature
     return g, (H + H.T) / 2
 
