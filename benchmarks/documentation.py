@@ -142,7 +142,7 @@ def ablation() -> str:
 
 
 def ranks() -> str:
-    """Return the times of several ranks and of one process, and the cost model."""
+    """Return what several ranks gain and cost."""
     return "\n\n".join(distributed.tables(distributed.RESULTS.read()))
 
 

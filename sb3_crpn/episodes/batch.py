@@ -195,6 +195,11 @@ class EpisodeBatch:
         """The number of steps that all ranks hold; every rank must ask."""
         return sum(gather_counts(self.n_steps))
 
+    @property
+    def total_size(self) -> int:
+        """The number of ``unit``s that all ranks hold; every rank must ask."""
+        return sum(gather_counts(self.size))
+
     def folds(self, n_folds: int) -> list[IntArray]:
         """Split the trajectories of all ranks into at most ``n_folds``; return this rank's part.
 

@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 from benchmarks.common.intervals import interval
-from benchmarks.learning import comparison, equal, report, store, tables
+from benchmarks.learning import comparison, equal, report, rollouts, store, tables
 from benchmarks.learning.__main__ import main
 from benchmarks.learning.run import N_BINS, Result, Run, learning_curve, make_run
 from benchmarks.learning.settings import (
@@ -181,6 +181,43 @@ def test_the_report_at_equal_settings_has_the_seeds_that_all_arms_have(tmp_path:
     text = equal.report(found)
     assert "| CRPN | 1.20 [" in text  # 60.5 / 50.5
     assert f"| {task} | 33,333 | 33,333 | 33,333 | 33,333 |" in text
+
+
+def test_rollouts_differ_in_nothing_else() -> None:
+    runs = rollouts.wanted_runs()
+    pairs = list(zip(runs[::2], runs[1::2], strict=True))
+    assert len(set(runs)) == len(runs)
+    for episodes, timesteps in pairs:
+        same = ("env", "seed", "timesteps", "entry")
+        assert all(getattr(episodes, name) == getattr(timesteps, name) for name in same)
+        ours, theirs = episodes.hyperparameters, timesteps.hyperparameters
+        assert ours.replace("rollout=episodes", "rollout=timesteps") == theirs != ours
+    many = [run for run, _ in pairs if run.arguments.get("n_envs") == 16]
+    assert {(run.env, run.arguments["n_steps"]) for run in many} == {
+        ("CartPole-v1", 32),
+        ("Pendulum-v1", 50),
+        ("HalfCheetah-v5", 64),
+        ("Hopper-v5", 128),
+    }
+
+
+def test_the_table_of_rollouts() -> None:
+    runs = pd.DataFrame(
+        {
+            "env": "CartPole-v1",
+            "timesteps": 100,
+            "setting": ["", "", "n_envs=16,n_steps=32,rollout=timesteps"],
+            "mean_return": [10.0, 30.0, 5.0],
+            "final_return": [20.0, 20.0, 7.0],
+            "episodes": [4, 6, 8],
+            "cpu_seconds": [1.0, 3.0, 5.0],
+        }
+    )
+    lines = rollouts.table(runs).splitlines()[2:]
+    assert lines == [
+        "| CartPole-v1 | 100 | 16 | timesteps | 1 | 5 | 7 | 8 | 5 |",
+        "| CartPole-v1 | 100 | entry's | episodes | 2 | 20 [10, 30] | 20 [20, 20] | 5 | 2 |",
+    ]
 
 
 def test_a_new_argument_does_not_make_another_run_but_another_value_does() -> None:
