@@ -1,4 +1,4 @@
-"""The tables of README.md and docs/, from the committed measurements.
+"""The tables of README.md and docs/, and the README's picture, from the committed measurements.
 
     python -m benchmarks.documentation          # rewrite the tables in place
     python -m benchmarks.documentation --check  # fail where a page differs
@@ -15,12 +15,15 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 
+from matplotlib.figure import Figure
+
 from benchmarks import distributed
 from benchmarks.common.markdown import estimate, markdown
 from benchmarks.learning import comparison, equal, store, tables
 from benchmarks.learning.comparison import Comparison
 from benchmarks.learning.settings import TRPO_EQUAL
 from benchmarks.learning.statistics import interquartile_mean, stratified_bootstrap
+from sb3_crpn.theory.__main__ import table as theory_table
 
 ROOT = Path(__file__).parents[1]
 LEARNING = Path(__file__).parent / "learning"
@@ -52,6 +55,8 @@ def main() -> None:
             stale.append(str(page.relative_to(ROOT)))
             if not check:
                 page.write_text(written)
+    if not check:
+        draw(ROOT / "docs" / "learning_curve.png")
     print("differ:" if check else "written:", ", ".join(stale) or "none")
     sys.exit(1 if check and stale else 0)
 
@@ -142,12 +147,27 @@ def ablation() -> str:
 
 
 def ranks() -> str:
-    """Return what several ranks gain and cost."""
+    """Return the times of several ranks and of one process, and the cost model."""
     return "\n\n".join(distributed.tables(distributed.RESULTS.read()))
 
 
 def _cells(found: Comparison, labels: Sequence[str], task: str, column: str) -> list[str]:
     return [tables.mean_cell(found.values(label, task, column)) for label in labels]
+
+
+def draw(path: Path) -> None:
+    """Draw CRPN's default settings on CartPole-v1: each seed, and their mean."""
+    found = _results("ablation", "CRPN (defaults)")
+    curves = found.learning_curves(found.baseline, "CartPole-v1 (50,000 steps)")
+    figure = Figure(figsize=(7.0, 4.5), layout="constrained")
+    axes = figure.subplots()
+    axes.axhline(475, color="gray", ls="--", lw=1, label="solved: 475")
+    axes.plot(curves.index, curves, color="C0", lw=1, alpha=0.4)
+    axes.plot(curves.index, curves.mean(axis=1), color="C0", lw=2, label="mean of the seeds")
+    axes.set(xlabel="timesteps", ylabel="return of training episodes", ylim=(0, 520))
+    axes.set_title(f"CRPN on CartPole-v1, default settings, {curves.shape[1]} seeds")
+    axes.legend(loc="lower right")
+    figure.savefig(path, dpi=120)
 
 
 TABLES: dict[str, Callable[[], str]] = {
@@ -156,6 +176,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "headline": headline,
     "learners": learners,
     "published": published,
+    "theory": theory_table,
 }
 
 if __name__ == "__main__":

@@ -55,7 +55,7 @@ def sums(theta: Tensor, episodes: list[Episode], psi: list[Tensor]) -> tuple[Ten
     observations, actions = (torch.cat(part) for part in list(zip(*episodes, strict=True))[:2])
     weight, bias = split(theta, observations.shape[1])
     log_pi = torch.log_softmax(observations @ weight.T + bias, 1)[range(len(actions)), actions]
-    parts = log_pi.split([len(part) for part in psi])
+    parts = torch.split(log_pi, [len(part) for part in psi])
     phi = [part @ weights for part, weights in zip(parts, psi, strict=True)]
     return torch.stack(phi), torch.stack([part.sum() for part in parts])
 
