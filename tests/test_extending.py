@@ -79,9 +79,9 @@ class CauchySolver:
 class AtLeast(EpisodeTracker):
     """Whole episodes, at least two of each environment."""
 
-    def begin(self, size, at_episode_start):
-        n_episodes = max(size.n_episodes, 2 * len(at_episode_start))
-        super().begin(replace(size, n_episodes=n_episodes), at_episode_start)
+    def begin(self, size, times):
+        n_episodes = max(size.n_episodes, 2 * len(times))
+        super().begin(replace(size, n_episodes=n_episodes), times)
 
 
 @configured

@@ -25,6 +25,7 @@ from benchmarks.common.table import Row
 from benchmarks.speed import (
     collection,
     device,
+    many,
     memory,
     products,
     scaling,
@@ -41,6 +42,7 @@ PARTS: dict[str, Callable[..., list[Row]]] = {
     "updates": updates.measure,
     "collection": collection.measure,
     "stepping": stepping.measure,
+    "many": many.measure,
     "training": training.measure,
     "solves": solves.measure,
     "scaling": scaling.measure,

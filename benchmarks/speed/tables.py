@@ -17,6 +17,7 @@ TITLES = {
     "updates": "Updates, in TRPO's",
     "collection": "Collection, per simulated step, in SB3's",
     "stepping": "Simulation, per step of an environment, in DummyVecEnv's",
+    "many": "Many environments, per timestep, in TRPO's",
     "training": "Training, per timestep, in TRPO's",
     "solves": "Solves of random cubic models",
     "scaling": "Cost against T and d",

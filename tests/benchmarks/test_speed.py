@@ -21,6 +21,7 @@ TINY = {
     "updates": {"repeats": 1, "n_steps": 64},
     "collection": {"repeats": 1, "n_steps": 64},
     "stepping": {"repeats": 1, "n_steps": 5},
+    "many": {"repeats": 1, "n_steps": 128, "n_cases": 1},
     "training": {"repeats": 1, "timesteps": 1},
     "solves": {"repeats": 1, "dense": (5, 8), "krylov": (10, 20)},
     "scaling": {"repeats": 2, "timesteps": (20, 40), "parameters": (100, 200), "n_steps": 20},
