@@ -16,6 +16,7 @@ least, to second order. It is compared with the entry's ``target_kl``, chosen by
 from __future__ import annotations
 
 import matplotlib.pyplot as plt
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -128,8 +129,11 @@ def table(rows: pd.DataFrame) -> str:
 def draw(rows: pd.DataFrame) -> Figure:
     """Draw the recommended divergence along training beside the entry's; print the table."""
     print(table(rows))
-    figure, axes = plt.subplots(1, len(ENVS), figsize=(12, 2.8), sharey=True, layout="constrained")
-    for axis, (env, group) in zip(axes, rows.groupby("env", sort=False), strict=False):
+    envs = rows.groupby("env", sort=False)
+    size = (2.6 * len(envs), 2.8)
+    figure, axes = plt.subplots(1, len(envs), figsize=size, sharey=True, layout="constrained")
+    axes = np.atleast_1d(axes)
+    for axis, (env, group) in zip(axes, envs, strict=True):
         for style, (_, run) in zip(("-", "--"), group.groupby("seed"), strict=False):
             for colour, (name, kls) in zip(PALETTE, recommendations(run).items(), strict=False):
                 axis.plot(run.timesteps, kls.clip(1e-4, 1.0), style, color=colour, label=name)
