@@ -40,7 +40,7 @@ def episode_time(lengths: IntArray, times: IntArray | int = 0) -> IntArray:
 @np.errstate(under="ignore")
 def discount_factors(gamma: float, lengths: IntArray, times: IntArray | int = 0) -> FloatArray:
     """Return γ^i, i the time of each step in its trajectory, [T]; 0 where that underflows."""
-    factors: FloatArray = gamma ** episode_time(lengths, times)
+    factors: FloatArray = np.power(gamma, episode_time(lengths, times))
     return factors
 
 
