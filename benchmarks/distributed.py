@@ -4,18 +4,18 @@ OMP_NUM_THREADS=1 torchrun --standalone --nproc-per-node 2 -m benchmarks.distrib
 python -m benchmarks.distributed --table
 
 One process and all ranks do the same work in turn, with as many environments in all; while rank 0
-works alone the others wait. The first command writes ``benchmarks/distributed.json``, the second
+works alone the others wait. The first command writes ``benchmarks/distributed.csv``, the second
 prints it as the tables of docs/DISTRIBUTED.md.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import statistics
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -26,10 +26,14 @@ import torch
 import torch.distributed as dist
 from stable_baselines3.common.env_util import make_vec_env
 
+from benchmarks.common.intervals import Estimate
+from benchmarks.common.markdown import estimate, markdown
+from benchmarks.common.parts import Parts
+from benchmarks.common.table import Row
 from sb3_crpn import CRPN
 from sb3_crpn.distributed import all_max, init_from_env, local_mode, rank, world_size
 
-RESULTS = Path(__file__).with_suffix(".json")
+RESULTS = Parts(Path(__file__).with_suffix(".csv"))
 MODES = ("one process", "all ranks")
 # Fisher and Hessian products in one timing
 N_PRODUCTS = 5
@@ -71,8 +75,8 @@ def timed(mode: str, work: Callable[[], object] | None) -> tuple[float, float]:
     return all_max(elapsed[0]), all_max(elapsed[1])
 
 
-def measure(env_id: str, n_envs: int, n_episodes: int, rounds: int) -> dict[str, Any]:
-    """Measure on all ranks; times in seconds."""
+def measure(env_id: str, n_envs: int, n_episodes: int, rounds: int) -> dict[str, list[Row]]:
+    """Measure on all ranks; return the rows of each part, times in seconds."""
     work: dict[str, dict[str, Callable[[], object]]] = {}
     for mode in MODES:
         with setting(mode):
@@ -82,15 +86,7 @@ def measure(env_id: str, n_envs: int, n_episodes: int, rounds: int) -> dict[str,
                 model.learn(1)
                 work[mode] = parts(model, n_episodes)
     n_timesteps = model.num_timesteps
-    times: dict[str, dict[str, list[tuple[float, float]]]] = {}
-    for part in work["all ranks"]:
-        times[part] = {mode: [] for mode in MODES}
-        for turn in range(rounds + 1):
-            for mode in MODES:
-                elapsed = timed(mode, work.get(mode, {}).get(part))
-                if turn:  # the first round warms up
-                    times[part][mode].append(elapsed)
-    return {
+    circumstances = {
         "env": env_id,
         "ranks": world_size(),
         "cores": len(os.sched_getaffinity(0)),
@@ -100,19 +96,38 @@ def measure(env_id: str, n_envs: int, n_episodes: int, rounds: int) -> dict[str,
         "timesteps": n_timesteps,
         "batch size": model.batch_size,
         "minibatches": model.n_critic_updates * math.ceil(n_timesteps / model.batch_size),
-        "times": times,
+    }
+    return {
+        "circumstances": [circumstances],
+        "times": times(work, rounds),
         "messages": messages(model),
         "reductions": reductions(),
     }
 
 
-def messages(model: CRPN) -> list[int]:
-    """Return the bytes of every message of a rollout and its update."""
-    sizes: list[int] = []
+def times(work: dict[str, dict[str, Callable[[], object]]], rounds: int) -> list[Row]:
+    """Return each part's times in each mode, a number a round, the modes in turn."""
+    rows = []
+    for part in work["all ranks"]:
+        found: dict[str, list[tuple[float, float]]] = {mode: [] for mode in MODES}
+        for turn in range(rounds + 1):
+            for mode in MODES:
+                elapsed = timed(mode, work.get(mode, {}).get(part))
+                if turn:  # the first round warms up
+                    found[mode].append(elapsed)
+        for mode, elapsed_times in found.items():
+            wall, cpu = zip(*elapsed_times, strict=True)
+            rows.append({"part": part, "mode": mode, "wall": list(wall), "cpu": list(cpu)})
+    return rows
+
+
+def messages(model: CRPN) -> list[Row]:
+    """Return how many messages of each size a rollout and its update send."""
+    sizes: Counter[int] = Counter()
 
     def counted(function: Callable[..., Any]) -> Callable[..., Any]:
         def call(tensor: torch.Tensor, *rest: Any) -> Any:
-            sizes.append(tensor.numel() * tensor.element_size())
+            sizes[tensor.numel() * tensor.element_size()] += 1
             return function(tensor, *rest)
 
         return call
@@ -122,11 +137,11 @@ def messages(model: CRPN) -> list[int]:
         mock.patch.object(dist, "broadcast", counted(dist.broadcast)),
     ):
         model.learn(1, reset_num_timesteps=False)
-    return sizes
+    return [{"bytes": size, "number": number} for size, number in sizes.items()]
 
 
-def reductions() -> dict[int, list[float]]:
-    """Return the seconds of reductions, by their bytes."""
+def reductions() -> list[Row]:
+    """Return the seconds of the fastest reduction of each size."""
     seconds: dict[int, list[float]] = {8 * size: [] for size in SIZES}
     for _ in range(REPEATS):
         for size in SIZES:
@@ -134,41 +149,52 @@ def reductions() -> dict[int, list[float]]:
             start = time.perf_counter()
             dist.all_reduce(tensor)
             seconds[8 * size].append(time.perf_counter() - start)
-    return seconds
+    return [{"bytes": size, "seconds": min(found)} for size, found in seconds.items()]
 
 
-def tables(results: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines of the tables."""
-    n_ranks = results["ranks"]
+def tables(results: dict[str, list[Row]]) -> Iterator[str]:
+    """Yield what was measured and what follows from it, a paragraph or a table each."""
+    (case,) = results["circumstances"]
     yield (
-        f"{results['env']}, {results['episodes']} episodes of {results['timesteps']} timesteps in "
-        f"all an update, d = {results['parameters']}, {results['cores']} cores, load average "
-        f"{results['load average']:.1f}\n"
+        f"{case['env']}, {case['episodes']} episodes of {case['timesteps']} timesteps in all an "
+        f"update, d = {case['parameters']}, {case['cores']} cores, load average "
+        f"{case['load average']:.1f}"
     )
-    header = f"one process, s | {n_ranks} ranks, s | speed-up | CPU time / that of the busier rank"
-    yield f"| | {header} |\n|---|---|---|---|---|"
-    for part, modes in results["times"].items():
-        one, many = (modes[mode] for mode in MODES)
-        wall = [statistics.median(t for t, _ in each) for each in (one, many)]
-        ratios = (_quartiles(one, many, clock) for clock in (0, 1))
-        yield f"| {part} | {wall[0]:.3f} | {wall[1]:.3f} | {' | '.join(ratios)} |"
-    critic = statistics.mode(results["messages"])
-    n_critic, total = results["minibatches"], sum(results["messages"])
-    n_others, others = len(results["messages"]) - n_critic, total - n_critic * critic
-    yield "\n| messages of an update | number | bytes in all |\n|---|---|---|"
-    yield f"| the critic's gradients | {n_critic} | {n_critic * critic:,} |"
-    yield f"| all others | {n_others} | {others:,} |"
-    yield from model_lines(results, n_critic, critic, n_others, others)
+    yield _times_table(results["times"], case["ranks"])
+    sizes = Counter({row["bytes"]: row["number"] for row in results["messages"]})
+    ((critic, _),) = sizes.most_common(1)
+    n_critic, n_others = case["minibatches"], sizes.total() - case["minibatches"]
+    others = sum(size * number for size, number in sizes.items()) - n_critic * critic
+    body = [
+        ["the critic's gradients", n_critic, f"{n_critic * critic:,}"],
+        ["all others", n_others, f"{others:,}"],
+    ]
+    yield markdown(["messages of an update", "number", "bytes in all"], body)
+    yield from model_tables(results, n_critic, critic, n_others, others)
 
 
-def _quartiles(one: list[list[float]], many: list[list[float]], clock: int) -> str:
-    ratios = [a[clock] / b[clock] for a, b in zip(one, many, strict=True)]
+def _times_table(rows: list[Row], n_ranks: int) -> str:
+    found = {(row["part"], row["mode"]): row for row in rows}
+    body = []
+    for part in dict.fromkeys(row["part"] for row in rows):
+        one, many = (found[part, mode] for mode in MODES)
+        wall = [f"{statistics.median(row['wall']):.3f}" for row in (one, many)]
+        ratios = [estimate(_quartiles(one[clock], many[clock])) for clock in ("wall", "cpu")]
+        body.append([part, *wall, *ratios])
+    head = ["", "one process, s", f"{n_ranks} ranks, s", "speed-up",
+            "CPU time / that of the busier rank"]  # fmt: skip
+    return markdown(head, body)
+
+
+def _quartiles(one: list[float], many: list[float]) -> Estimate:
+    """Return the median and the quartiles of the rounds' ratios."""
+    ratios = [a / b for a, b in zip(one, many, strict=True)]
     low, middle, high = statistics.quantiles(ratios, n=4)
-    return f"{middle:.2f} [{low:.2f}, {high:.2f}]"
+    return Estimate(middle, low, high)
 
 
-def model_lines(
-    results: dict[str, Any], n_critic: int, critic: int, n_others: int, others: int
+def model_tables(
+    results: dict[str, list[Row]], n_critic: int, critic: int, n_others: int, others: int
 ) -> Iterator[str]:
     """Yield what more ranks would do, each with the timesteps that one process had.
 
@@ -177,42 +203,43 @@ def model_lines(
     the same, whatever W: packing them, waking up, and minibatches too small to be efficient. Work
     and messages are taken at their fastest, when other processes disturbed them least.
     """
-    fastest = {int(size): min(seconds) for size, seconds in results["reductions"].items()}
+    (case,) = results["circumstances"]
+    fastest = {row["bytes"]: row["seconds"] for row in results["reductions"]}
     small, large = min(fastest), max(fastest)
-    hops = 2 * (results["ranks"] - 1)
+    hops = 2 * (case["ranks"] - 1)
     per_hop = fastest[small] / hops
-    per_byte = (fastest[large] - fastest[small]) / (large - small) * results["ranks"] / hops
+    per_byte = (fastest[large] - fastest[small]) / (large - small) * case["ranks"] / hops
 
     def reducing(number: float, total_bytes: float, n_ranks: int) -> float:
         hops = 2 * (n_ranks - 1)
         return number * hops * per_hop + total_bytes * hops / n_ranks * per_byte
 
     one, many = (
-        {part: min(t[0] for t in times[mode]) for part, times in results["times"].items()}
+        {row["part"]: min(row["wall"]) for row in results["times"] if row["mode"] == mode}
         for mode in MODES
     )
     number, total = n_others + n_critic, others + n_critic * critic
-    explained = one["update"] / results["ranks"] + reducing(number, total, results["ranks"])
+    explained = one["update"] / case["ranks"] + reducing(number, total, case["ranks"])
     per_message = max(0.0, many["update"] - explained) / number
     work = one["collection"] + one["update"]
     yield (
-        f"\n{1e6 * per_message:.0f} µs a message and {1e6 * per_hop:.0f} µs a hop, "
-        f"{1e-9 / per_byte:.1f} GB/s, {work:.2f} s of work an update\n\n"
-        "| ranks | `batch_size` | messages, s | efficiency | timesteps/s | episodes/s |"
-        "\n|---|---|---|---|---|---|"
+        f"{1e6 * per_message:.0f} µs a message and {1e6 * per_hop:.0f} µs a hop, "
+        f"{1e-9 / per_byte:.1f} GB/s, {work:.2f} s of work an update"
     )
-    for own in (results["batch size"], results["timesteps"]):  # a rank's part of a minibatch
-        minibatches = n_critic * results["batch size"] / own
+    body = []
+    for own in (case["batch size"], case["timesteps"]):  # a rank's part of a minibatch
+        minibatches = n_critic * case["batch size"] / own
         for n_ranks in RANKS:
             number = n_others + minibatches
             waiting = number * per_message
             waiting += reducing(number, others + minibatches * critic, n_ranks)
             rate = n_ranks / (work + waiting)
-            yield (
-                f"| {n_ranks} | {n_ranks} · {own} | {waiting:.2f} "
-                f"| {100 * work / (work + waiting):.0f} % | {rate * results['timesteps']:,.0f} "
-                f"| {rate * results['episodes']:,.1f} |"
-            )
+            body.append([n_ranks, f"{n_ranks} · {own}", f"{waiting:.2f}",
+                         f"{100 * work / (work + waiting):.0f} %",
+                         f"{rate * case['timesteps']:,.0f}",
+                         f"{rate * case['episodes']:,.1f}"])  # fmt: skip
+    head = ["ranks", "`batch_size`", "messages, s", "efficiency", "timesteps/s", "episodes/s"]
+    yield markdown(head, body)
 
 
 def main() -> None:
@@ -232,8 +259,9 @@ def main() -> None:
         results = measure(arguments.env, arguments.n_envs, arguments.n_episodes, arguments.rounds)
         if rank() > 0:
             return
-        RESULTS.write_text(json.dumps(results, indent=1))
-    print("\n".join(tables(json.loads(RESULTS.read_text()))))
+        for part, rows in results.items():
+            RESULTS.replace(part, rows)
+    print("\n\n".join(tables(RESULTS.read())))
 
 
 if __name__ == "__main__":

@@ -22,13 +22,13 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_crpn import ACRPN, CRPN
+from sb3_crpn.cli import parse
 from sb3_crpn.distributed import broadcast, init_from_env, rank, world_size
 
 if TYPE_CHECKING:
     from optuna import Trial
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"crpn": CRPN, "acrpn": ACRPN}
-SCRIPTS = ("train", "enjoy", "plot_train", "all_plots", "plot_from_file")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -39,16 +39,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     SystemExit
         The arguments are wrong, or rl_zoo3 or what it needs is not installed.
     """
-    parser = argparse.ArgumentParser(
-        prog="sb3-crpn", description="rl-zoo's scripts with CRPN and ACRPN."
-    )
-    parser.add_argument("script", choices=SCRIPTS, help="its own options follow; see SCRIPT --help")
-    parser.add_argument("options", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
-    parsed = parser.parse_args(arguments)
+    parsed = parse(arguments)
     try:
         import rl_zoo3.cli
     except ModuleNotFoundError as error:
-        sys.exit(f'sb3-crpn: {error}; install the extra: pip install "sb3-crpn[zoo]"')
+        sys.exit(f'sb3-crpn: {error}; install the extra: pip install ".[zoo]" in a clone')
     register()
     options = parsed.options
     if parsed.script == "train":

@@ -46,6 +46,18 @@ CASES = {
     "dict": lambda algorithm: make(
         algorithm, DummyVecEnv([_sampler] * 2), policy="MultiInputPolicy"
     ),
+    "timesteps": lambda algorithm: make(
+        algorithm,
+        make_vec_env("CartPole-v1", 3, seed=0),
+        rollout="timesteps",
+        discount_visitation=True,
+    ),
+    "endless": lambda algorithm: make(
+        algorithm,
+        make_vec_env(lambda: Drift(bound=np.inf, limit=np.inf, dim=2), 2, seed=0),
+        rollout="timesteps",
+        n_reused_rollouts=1,
+    ),
     "paper": lambda algorithm: make(
         algorithm, gym.make("CartPole-v1"), n_episodes=5, n_hessian_episodes=3, alpha=1e3, **PAPER
     ),
@@ -82,11 +94,19 @@ def _parameters(model):
     return vector.detach().numpy().copy()
 
 
-def on_ranks(folder):
+def on_ranks(folder, **arguments):
     """Parameters after updates on this rank, with environments of its own."""
     env = make_vec_env(lambda: Drift(), 2, seed=rank())
-    model = make(CRPN, env, n_steps=48).learn(200)
+    model = make(CRPN, env, n_steps=48, **arguments).learn(200)
     return _parameters(model)
+
+
+def timesteps_on_ranks(folder):
+    """The same from timesteps."""
+    return on_ranks(folder, rollout="timesteps")
+
+
+ON_RANKS = {"CRPN-ranks": on_ranks, "CRPN-ranks-timesteps": timesteps_on_ranks}
 
 
 def recorded(parameters):
@@ -125,16 +145,18 @@ def test_parameters_are_as_recorded(identity):
 
 
 def test_two_ranks_are_as_recorded(tmp_path):
-    _, [(own, other)] = run_ranks([on_ranks], tmp_path)
-    assert np.array_equal(own, other)
-    check("CRPN-ranks", own)
+    _, results = run_ranks(list(ON_RANKS.values()), tmp_path)
+    for identity, (own, other) in zip(ON_RANKS, results, strict=True):
+        assert np.array_equal(own, other)
+        check(identity, own)
 
 
 def _record():
     torch.set_num_threads(1)
     cases = {identity: recorded(trained(identity)) for identity in IDS}
     with tempfile.TemporaryDirectory() as folder:
-        cases["CRPN-ranks"] = recorded(run_ranks([on_ranks], folder)[1][0][0])
+        _, results = run_ranks(list(ON_RANKS.values()), folder)
+    cases |= {name: recorded(own) for name, (own, _) in zip(ON_RANKS, results, strict=True)}
     SNAPSHOT.write_text(json.dumps({"machine": machine(), "cases": cases}, indent=1) + "\n")
 
 

@@ -144,7 +144,7 @@ class Watch:
     """Keeps what a rank's running moments are updated with, and the policy after updates."""
 
     def __init__(self, monkeypatch, env):
-        update, give = RunningMeanStd.update, sb3_crpn.algorithm.ranks.broadcast_state
+        update, give = RunningMeanStd.update, sb3_crpn.algorithm.update.share_policy
         self.seen, self.states = defaultdict(list), []
 
         def recorded(moments, array):
@@ -159,7 +159,7 @@ class Watch:
             give(policy)
 
         monkeypatch.setattr(RunningMeanStd, "update", recorded)
-        monkeypatch.setattr(sb3_crpn.algorithm.ranks, "broadcast_state", compared)
+        monkeypatch.setattr(sb3_crpn.algorithm.update, "share_policy", compared)
 
 
 def trained(folder, algorithm, n_updates, **arguments):

@@ -1,14 +1,17 @@
 """docs/EXTENDING.md, followed: variants defined here are trained with, saved and loaded."""
 
 import copy
+import inspect
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
 
 from sb3_crpn import CRPN
+from sb3_crpn.algorithm.declaration import configured, setting
 from sb3_crpn.algorithm.solvers import SOLVERS, DenseSolver
+from sb3_crpn.checks import COUNT
 from sb3_crpn.cubic import CubicStep
 from sb3_crpn.cubic.approximate import cauchy_radius
 from sb3_crpn.curvature import (
@@ -20,7 +23,8 @@ from sb3_crpn.curvature import (
     Fisher,
     JamesStein,
 )
-from tests.training import make, same, several, tensors
+from sb3_crpn.episodes import TRACKERS, EpisodeTracker
+from tests.training import TrainLog, make, same, several, tensors
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,27 @@ class CauchySolver:
         return CubicStep(
             -radius / norm * g, alpha * radius / 2, decrease, 1, math.nan, False, "Cauchy point"
         )
+
+
+class AtLeast(EpisodeTracker):
+    """Whole episodes, at least two of each environment."""
+
+    def begin(self, size, times):
+        n_episodes = max(size.n_episodes, 2 * len(times))
+        super().begin(replace(size, n_episodes=n_episodes), times)
+
+
+@configured
+class MyCRPN(CRPN):
+    """CRPN whose target is halved every so many updates.
+
+    {parameters}
+    """
+
+    halve_every: int = setting(COUNT, "Updates between halvings of ``target_kl``.", 10)
+
+    def _update_target_kl(self, batch):
+        return super()._update_target_kl(batch) / 2 ** (self._n_updates // self.halve_every)
 
 
 VARIANTS = {
@@ -134,3 +159,28 @@ def test_names_stand_for_objects(name, value):
 def test_a_class_is_no_object(argument):
     with pytest.raises(ValueError, match=f"{argument}=<class .* must be"):
         make(CRPN, **{argument: VARIANTS[argument][1]})
+
+
+def test_a_tracker_decides_what_a_rollout_keeps(tmp_path, monkeypatch):
+    log, fewer = TrainLog(), TrainLog()
+    model = make(CRPN, several(2), rollout=AtLeast, n_episodes=2).learn(80, log)
+    assert set(log["n_episodes"]) == {4}
+    make(CRPN, several(2), n_episodes=2).learn(80, fewer)
+    assert set(fewer["n_episodes"]) == {2}
+    monkeypatch.setitem(TRACKERS, "at least two", AtLeast)
+    named = make(CRPN, several(2), rollout="at least two", n_episodes=2).learn(80)
+    assert same(named, tensors(model))
+    model.save(tmp_path / "model")
+    assert CRPN.load(tmp_path / "model", device="cpu").rollout is AtLeast
+
+
+def test_an_argument_is_declared_once(tmp_path):
+    assert inspect.signature(MyCRPN).parameters["halve_every"].default == 10
+    assert "halvings of ``target_kl``" in MyCRPN.__doc__
+    with pytest.raises(ValueError, match="MyCRPN: halve_every=0 is not allowed, must be"):
+        make(MyCRPN, halve_every=0)
+    log = TrainLog()
+    model = make(MyCRPN, halve_every=2, target_kl=0.02, scale_target_kl=False).learn(200, log)
+    assert log["target_kl"][:5] == [0.02, 0.02, 0.01, 0.01, 0.005]
+    model.save(tmp_path / "model")
+    assert MyCRPN.load(tmp_path / "model", device="cpu").halve_every == 2

@@ -205,7 +205,7 @@ def test_without_rl_zoo3_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "rl_zoo3", None)
     with pytest.raises(SystemExit) as stop:
         main(["train", "--algo", "crpn"])
-    assert 'pip install "sb3-crpn[zoo]"' in stop.value.code
+    assert 'pip install ".[zoo]"' in stop.value.code
     assert "\n" not in stop.value.code
 
 

@@ -38,11 +38,11 @@ def expected_causal_hessian(mdp: TabularMDP, theta: Tensor, kappa: float) -> Ten
     past = torch.zeros(len(reached), mdp.n_parameters, dtype=torch.float64)
     total = torch.zeros(mdp.n_parameters, mdp.n_parameters, dtype=torch.float64)
     for h in range(mdp.horizon):
-        gain = mdp.reward + mdp.gamma * mdp.transition @ values[h + 1] - values[h][:, None]
+        gain = mdp.action_values(values[h + 1]) - values[h][:, None]
         weighted = -(mdp.gamma**h) * policy * gain
         crossed = past.T @ torch.einsum("sa,saj->sj", weighted, scores)
         total += torch.einsum("s,sa,saij->ij", reached, weighted, at_once) + crossed + crossed.T
-        flow = policy[:, :, None] * mdp.transition  # P(a, s' | s)
+        flow = policy[:, :, None] * mdp.flow  # P(a, s' | s)
         past = kappa * (
             torch.einsum("si,sat->ti", past, flow)
             + torch.einsum("s,sat,sai->ti", reached, flow, scores)

@@ -23,6 +23,7 @@ class _Dynamics:
         self.observation_space = spaces.Box(0.0, 1.0, (mdp.n_observations,), np.float32)
         self.action_space = spaces.Discrete(mdp.n_actions)
         self.reward = mdp.reward.numpy()
+        self._stop = None if mdp.stop is None else mdp.stop.numpy()
         self._initial = mdp.initial.cumsum(0).numpy()
         self._transition = mdp.transition.cumsum(2).numpy()
         self._seen = np.eye(mdp.n_observations, dtype=np.float32)[mdp.observation.numpy()]
@@ -32,6 +33,12 @@ class _Dynamics:
 
     def after(self, rng: np.random.Generator, states: Array, actions: Array) -> Array:
         return self._draw(self._transition[states, actions], rng, len(states))
+
+    def stops(self, rng: np.random.Generator, states: Array, actions: Array) -> Array:
+        if self._stop is None:
+            return np.zeros(len(states), dtype=bool)
+        stops: Array = rng.random(len(states)) < self._stop[states, actions]
+        return stops
 
     def see(self, states: Array) -> Array:
         return self._seen[states]
@@ -44,7 +51,7 @@ class _Dynamics:
 
 
 class TabularEnv(gym.Env[Array, int]):
-    """Simulates a :class:`TabularMDP`; step H terminates the episode."""
+    """Simulates a :class:`TabularMDP`; it stops at random, or after step H."""
 
     def __init__(self, mdp: TabularMDP) -> None:
         self._dynamics, self._horizon = _Dynamics(mdp), mdp.horizon
@@ -64,17 +71,26 @@ class TabularEnv(gym.Env[Array, int]):
         self._time += 1
         actions = np.array([action])
         reward = self._dynamics.reward[self._state, actions].item()
+        stops = self._dynamics.stops(self.np_random, self._state, actions).item()
         self._state = self._dynamics.after(self.np_random, self._state, actions)
         observation = self._dynamics.see(self._state)[0]
-        return observation, reward, self._time == self._horizon, False, {}
+        return observation, reward, stops or self._time == self._horizon, False, {}
 
 
 class TabularVectorEnv(VectorEnv[Array, Array, Array]):
-    """The same for ``num_envs`` episodes in parallel, which begin and end together."""
+    """The same for ``num_envs`` episodes in parallel, which begin and end together.
+
+    Raises
+    ------
+    ValueError
+        Episodes may stop before step H.
+    """
 
     metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(self, mdp: TabularMDP, num_envs: int) -> None:
+        if mdp.stop is not None:
+            raise ValueError("TabularVectorEnv: mdp.stop is not allowed, must be None")
         self._dynamics, self._horizon = _Dynamics(mdp), mdp.horizon
         self.num_envs = num_envs
         self.single_observation_space = self._dynamics.observation_space

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -27,9 +27,11 @@ class TabularMDP:
     observation
         What is seen in each state, integers below O, [S]. Two states that look alike are aliased.
     horizon
-        H; every episode takes H steps.
+        H; episodes take at most H steps.
     gamma
         γ in [0, 1].
+    stop
+        Probability that the episode ends with step h < H, of (s_h, a_h), [S, A]; ``None``: 0.
     """
 
     initial: Tensor
@@ -38,6 +40,7 @@ class TabularMDP:
     observation: Tensor
     horizon: int
     gamma: float = 1.0
+    stop: Tensor | None = None
 
     @property
     def n_observations(self) -> int:
@@ -54,6 +57,13 @@ class TabularMDP:
         """The length of θ, d = A(O + 1)."""
         return self.n_actions * (self.n_observations + 1)
 
+    @property
+    def flow(self) -> Tensor:
+        """P(s_{h+1}, the episode goes on | s_h, a_h), [S, A, S]."""
+        if self.stop is None:
+            return self.transition
+        return (1.0 - self.stop)[..., None] * self.transition
+
     def probabilities(self, theta: Tensor) -> Tensor:
         """Return π(a|s; θ) for the hidden states, [S, A]."""
         weight, bias = theta.split([self.n_parameters - self.n_actions, self.n_actions])
@@ -65,9 +75,12 @@ class TabularMDP:
         probabilities = self.probabilities(theta)
         values = [torch.zeros_like(self.initial)]
         for _ in range(self.horizon):
-            action_values = self.reward + self.gamma * self.transition @ values[0]
-            values.insert(0, (probabilities * action_values).sum(1))
+            values.insert(0, (probabilities * self.action_values(values[0])).sum(1))
         return torch.stack(values)
+
+    def action_values(self, values: Tensor) -> Tensor:
+        """Return Q_h(s, a) = r(s, a) + γ E[V_{h+1}(s_{h+1})] of V_{h+1} [S], [S, A]."""
+        return self.reward + self.gamma * self.flow @ values
 
     def cost(self, theta: Tensor) -> Tensor:
         """Return J(θ) = -E[Σ_h γ^h r_h], a scalar."""
@@ -81,6 +94,28 @@ class TabularMDP:
         """Return ∇²J(θ), exactly symmetric, [d, d]."""
         hessian = torch.autograd.functional.hessian(self.cost, theta)
         return 0.5 * (hessian + hessian.T)
+
+    def surrogate(self, theta: Tensor, behaviour: Tensor, visitation_discount: float) -> Tensor:
+        r"""Return the surrogate that improves on a behaviour policy θ', a scalar.
+
+        .. math:: -\sum_h c^h \, \mathrm{E}_{s_h \sim θ'} \sum_a π(a|s_h; θ) Q_h(s_h, a; θ')
+
+        At θ = θ' its gradient is ∇J for c = γ, and its Hessian is not ∇²J: the terms across time
+        are missing.
+        """
+        policy, values = self.probabilities(theta), self.values(behaviour)
+        kernel = torch.einsum("sa,sat->st", self.probabilities(behaviour), self.flow)
+        reached, total = self.initial, torch.zeros((), dtype=torch.float64)
+        for h in range(self.horizon):
+            gain = (policy * self.action_values(values[h + 1])).sum(1)
+            total = total - visitation_discount**h * (reached @ gain)
+            reached = reached @ kernel
+        return total
+
+    def mean_length(self, theta: Tensor) -> float:
+        """Return the expected number of steps of an episode."""
+        count = replace(self, reward=torch.ones_like(self.reward), gamma=1.0)
+        return -count.cost(theta).item()
 
     def is_sosp(self, theta: Tensor, epsilon: float, rho: float) -> bool:
         """Whether ‖∇J‖ ≤ ε and λ_min(∇²J) ≥ -√(ρε): an ε-second-order stationary point."""
@@ -133,16 +168,18 @@ def random_mdp(
     horizon: int = 5,
     gamma: float = 0.9,
     concentration: float = 1.0,
+    max_stop: float = 0.0,
 ) -> TabularMDP:
     """Draw an MDP with rewards uniform in [-1, 1].
 
     Transitions are Dirichlet(``concentration``): the smaller, the more nearly deterministic. States
-    are spread over the observations in turn; by default each has its own.
+    are spread over the observations in turn; by default each has its own. The probabilities that
+    the episode stops are uniform in [0, ``max_stop``].
     """
     rng = np.random.default_rng(seed)
     n_observations = n_states if n_observations is None else n_observations
     weights = np.full(n_states, concentration)
-    return TabularMDP(
+    mdp = TabularMDP(
         initial=torch.from_numpy(rng.dirichlet(np.ones(n_states))),
         transition=torch.from_numpy(rng.dirichlet(weights, (n_states, n_actions))),
         reward=torch.from_numpy(rng.uniform(-1.0, 1.0, (n_states, n_actions))),
@@ -150,3 +187,6 @@ def random_mdp(
         horizon=horizon,
         gamma=gamma,
     )
+    if not max_stop:
+        return mdp
+    return replace(mdp, stop=torch.from_numpy(rng.uniform(0.0, max_stop, (n_states, n_actions))))

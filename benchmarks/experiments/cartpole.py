@@ -21,7 +21,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 
-from benchmarks.experiments.study import PALETTE, Row, Study, interval
+from benchmarks.common.figures import PALETTE
+from benchmarks.common.intervals import interval
+from benchmarks.common.markdown import estimate, markdown
+from benchmarks.common.table import Row
+from benchmarks.experiments.study import Study
 from sb3_crpn import ACRPN, CRPN, PAPER
 from sb3_crpn.vec_env import GymnasiumVecEnv
 
@@ -124,11 +128,7 @@ def draw(rows: pd.DataFrame) -> Figure:
 
 def table(rows: pd.DataFrame) -> str:
     """Return a Markdown table: medians over seeds with intervals."""
-    lines = [
-        "| | changed | solved | at update | best mean of 100 episodes "
-        "| mean of the last 10 updates | noise of g | negative share | largest KL of an update |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    body = []
     for (algorithm, change), group in rows.groupby(["algorithm", "change"], sort=False):
         runs = [run for _, run in group.groupby("seed")]
         pairs = [_pair_means(run) for run in runs]
@@ -144,8 +144,11 @@ def table(rows: pd.DataFrame) -> str:
             _cell([run.negative_share.median() for run in runs], ".2f"),
             _cell([run.kl_divergence.max() for run in runs], ".2f"),
         ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        body.append(cells)
+    head = ["", "changed", "solved", "at update", "best mean of 100 episodes",
+            "mean of the last 10 updates", "noise of g", "negative share",
+            "largest KL of an update"]  # fmt: skip
+    return markdown(head, body)
 
 
 def _pair_means(run: pd.DataFrame) -> NDArray[np.float64]:
@@ -154,11 +157,10 @@ def _pair_means(run: pd.DataFrame) -> NDArray[np.float64]:
     return (returns[1:] + returns[:-1]) / 2
 
 
-def _cell(values: list[float], digits: str) -> str:
+def _cell(values: list[float], spec: str) -> str:
     if np.isnan(values).any():  # not logged
         return "-"
-    middle, low, high = (format(value, digits) for value in interval(values))
-    return f"{middle} [{low}, {high}]"
+    return estimate(interval(values, statistic=np.median), spec)
 
 
 def _draw_curves(axis: Axes, rows: pd.DataFrame) -> None:

@@ -18,9 +18,12 @@ import torch
 from matplotlib.figure import Figure
 from scipy.stats import binomtest
 
+from benchmarks.common.figures import PALETTE
+from benchmarks.common.markdown import markdown
+from benchmarks.common.table import Row
 from benchmarks.exact import TabularMDP, coordination_mdp, random_mdp
 from benchmarks.experiments.learners import make_learner
-from benchmarks.experiments.study import PALETTE, Row, Study
+from benchmarks.experiments.study import Study
 from sb3_crpn.sosp import certify_sosp
 
 CONFIDENCE = 0.95
@@ -140,7 +143,7 @@ def draw(rows: pd.DataFrame) -> Figure:
 
 def table(rows: pd.DataFrame) -> str:
     """Return a Markdown table of decided and false verdicts with exact binomial intervals."""
-    lines = ["| truth | episodes | right | undecided | false | false sosp |", "|---" * 6 + "|"]
+    body = []
     groups = [*rows.groupby(["case", "episodes"], sort=False), (("all", "all"), rows)]
     for (case, episodes), group in groups:
         n = group[list(VERDICTS)].to_numpy().sum()
@@ -150,8 +153,8 @@ def table(rows: pd.DataFrame) -> str:
         possible = group[group.truth != "sosp"][list(VERDICTS)].to_numpy().sum()
         cells = [_share(right, n), _share(group.undecided.sum(), n), _share(wrong, n)]
         cells.append(_share(false_sosp, possible) if possible else "-")
-        lines.append(f"| {case} | {episodes} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        body.append([case, episodes, *cells])
+    return markdown(["truth", "episodes", "right", "undecided", "false", "false sosp"], body)
 
 
 def _share(count: int, n: int) -> str:

@@ -21,9 +21,13 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from benchmarks.common.figures import PALETTE
+from benchmarks.common.intervals import interval, ratio_of_medians
+from benchmarks.common.markdown import estimate, markdown
+from benchmarks.common.table import Row
 from benchmarks.exact import coordination_mdp
 from benchmarks.experiments.learners import make_learner, run_until
-from benchmarks.experiments.study import PALETTE, Row, Study, interval, ratio_of_medians
+from benchmarks.experiments.study import Study
 
 BATCH, CAP, LEFT = 64, 20_000, 0.5
 STARTS = {
@@ -99,23 +103,18 @@ def _select(
 
 def table(rows: pd.DataFrame) -> str:
     """Return a Markdown table of the runs with the values used."""
-    lines = [
-        "| start | algorithm | median episodes | escaped | episodes / CRPN, paper |",
-        "|---|---|---|---|---|",
-    ]
+    body = []
     for start in STARTS:
         unit = _select(rows, "CRPN, paper", start=start).episodes
         for algorithm in KNOBS:
             runs = _select(rows, algorithm, start=start)
-            middle = "{:.0f} [{:.0f}, {:.0f}]".format(*interval(runs.episodes))
-            ratio = interval(runs.episodes, unit, statistic=ratio_of_medians)
+            middle = estimate(interval(runs.episodes, statistic=np.median), ".0f")
+            ratio = estimate(interval(runs.episodes, unit, statistic=ratio_of_medians), ".1f")
             bound = "" if runs.escaped.all() else "≥ "
-            factor = "{:.1f} [{:.1f}, {:.1f}]".format(*ratio)
-            lines.append(
-                f"| {start} | {algorithm} | {bound}{middle} "
-                f"| {runs.escaped.sum()} of {len(runs)} | {bound}{factor} |"
-            )
-    return "\n".join(lines)
+            escaped = f"{runs.escaped.sum()} of {len(runs)}"
+            body.append([start, algorithm, bound + middle, escaped, bound + ratio])
+    head = ["start", "algorithm", "median episodes", "escaped", "episodes / CRPN, paper"]
+    return markdown(head, body)
 
 
 def _draw_starts(axis: Axes, rows: pd.DataFrame) -> None:
@@ -164,7 +163,10 @@ def _draw_batches(axis: Axes, rows: pd.DataFrame) -> None:
     for start, style in (("saddle", "o-"), ("noisy", "^--")):
         for algorithm in SWEPT:
             bands = [
-                interval(_select(rows, algorithm, start=start, batch=b).episodes) for b in sizes
+                interval(
+                    _select(rows, algorithm, start=start, batch=b).episodes, statistic=np.median
+                )
+                for b in sizes
             ]
             middle, low, high = np.array(bands).T
             label = algorithm if start == "saddle" else None

@@ -28,9 +28,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from benchmarks.common.figures import PALETTE
+from benchmarks.common.intervals import Estimate, interval
+from benchmarks.common.markdown import estimate, markdown
+from benchmarks.common.table import Row
 from benchmarks.exact import TabularMDP, coordination_mdp, random_mdp
 from benchmarks.experiments.learners import make_learner, run_until
-from benchmarks.experiments.study import PALETTE, Row, Study, interval
+from benchmarks.experiments.study import Study
 from sb3_crpn.cubic import solve_dense
 
 BATCH_CONSTANT = 8
@@ -129,8 +133,7 @@ def exact_updates(problem: Problem, algorithm: str) -> list[int]:
 
 def draw(rows: pd.DataFrame) -> Figure:
     """Draw episodes against ε for each problem and print the slopes."""
-    print("| problem | algorithm | slope of episodes | of updates | exact, ε ≤ 0.005 | bound |")
-    print("|---" * 6 + "|")
+    body = []
     figure, axes = plt.subplots(1, len(PROBLEMS), figsize=(9, 3.8), layout="constrained")
     for axis, (name, problem) in zip(axes, PROBLEMS.items(), strict=True):
         for algorithm, bound in BOUNDS.items():
@@ -138,10 +141,10 @@ def draw(rows: pd.DataFrame) -> Figure:
             episodes = chosen.pivot_table(index="seed", columns="epsilon", values="episodes")
             slopes = interval_of_slopes(episodes)
             of_updates = interval_of_slopes(episodes * episodes.columns.to_numpy() ** 2)
-            texts = ["{:.2f} [{:.2f}, {:.2f}]".format(*cell) for cell in (slopes, of_updates)]
+            texts = [estimate(cell, ".2f") for cell in (slopes, of_updates)]
             exact = np.array(exact_updates(problem, algorithm)) / np.array(EXACT_EPSILONS) ** 2
             limit = np.polyfit(np.log(EXACT_EPSILONS[-3:]), np.log(exact[-3:]), 1)[0]
-            print(f"| {name} | {algorithm} | {' | '.join(texts)} | {limit:.2f} | {bound:g} |")
+            body.append([name, algorithm, *texts, f"{limit:.2f}", f"{bound:g}"])
             axis.plot(EXACT_EPSILONS, BATCH_CONSTANT * exact, "--", lw=1, color=COLOURS[algorithm])
             _draw_fit(axis, algorithm, episodes, slopes, bound)
         axis.plot([], [], "--", lw=1, color="0.4", label="exact derivatives")
@@ -152,10 +155,12 @@ def draw(rows: pd.DataFrame) -> Figure:
         axis.set_title(problem.title, fontsize=9)
         axis.invert_xaxis()
         axis.legend(loc="lower right", fontsize=7)
+    head = ["problem", "algorithm", "slope of episodes", "of updates", "exact, ε ≤ 0.005", "bound"]
+    print(markdown(head, body))
     return figure
 
 
-def interval_of_slopes(episodes: pd.DataFrame) -> tuple[float, float, float]:
+def interval_of_slopes(episodes: pd.DataFrame) -> Estimate:
     """Return the mean over seeds of the slope of log episodes [seeds, ε] in log ε, an interval."""
     x = np.log(episodes.columns.to_numpy(dtype=float))
     slopes = np.polyfit(x, np.log(episodes.to_numpy(dtype=float)).T, 1)[0]
@@ -166,14 +171,16 @@ def _draw_fit(
     axis: Axes,
     algorithm: str,
     episodes: pd.DataFrame,
-    slopes: tuple[float, float, float],
+    slopes: Estimate,
     bound: float,
 ) -> None:
     epsilons: NDArray[np.float64] = episodes.columns.to_numpy(dtype=float)
-    bands = np.array([interval(episodes[epsilon]) for epsilon in episodes.columns])
+    bands = np.array(
+        [interval(episodes[epsilon], statistic=np.median) for epsilon in episodes.columns]
+    )
     middle, low, high = bands.T
     colour = COLOURS[algorithm]
-    label = "{}: slope {:.2f} [{:.2f}, {:.2f}]".format(algorithm, *slopes)
+    label = f"{algorithm}: slope {estimate(slopes, '.2f')}"
     axis.plot(epsilons, middle, "o-", ms=4, color=colour, label=label)
     axis.fill_between(epsilons, low, high, color=colour, alpha=0.2, lw=0)
     reference = middle[-1] * (epsilons / epsilons[-1]) ** bound

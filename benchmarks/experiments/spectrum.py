@@ -33,7 +33,9 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
-from benchmarks.experiments.study import PALETTE, Row, Study
+from benchmarks.common.figures import PALETTE
+from benchmarks.common.table import Row
+from benchmarks.experiments.study import Study
 from sb3_crpn import CRPN
 from sb3_crpn.curvature import Causal
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives

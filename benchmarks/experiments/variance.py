@@ -25,9 +25,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from benchmarks.common.figures import PALETTE
+from benchmarks.common.intervals import interval
+from benchmarks.common.markdown import estimate, markdown
+from benchmarks.common.table import Row
 from benchmarks.exact import TabularMDP, expected_causal_hessian, random_mdp
 from benchmarks.experiments.learners import make_learner
-from benchmarks.experiments.study import PALETTE, Row, Study, interval
+from benchmarks.experiments.study import Study
 from sb3_crpn import CRPN
 from sb3_crpn.curvature import Causal, HessianEstimator, Trajectory
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives
@@ -131,15 +135,17 @@ def _bias(mdp: TabularMDP, theta: torch.Tensor, truth: torch.Tensor, kappa: floa
 def draw(rows: pd.DataFrame) -> Figure:
     """Draw the two panels and print the ratios."""
     unbiased = rows[rows.kappa == 1.0]
-    print("| horizon | trajectory / causal: " + " | ".join(BASELINES), end=" | ")
-    print("causal, none / fitted | none / exact | trajectory, none / causal, exact |")
-    print("|---" * 7 + "|")
+    body = []
     for horizon in HORIZONS:
         chosen = unbiased[unbiased.horizon == horizon]
         cells = [_ratio(chosen, ("trajectory", name), ("causal", name)) for name in BASELINES]
         cells += [_ratio(chosen, ("causal", "none"), ("causal", k)) for k in ("fitted", "exact")]
         cells.append(_ratio(chosen, ("trajectory", "none"), ("causal", "exact")))
-        print(f"| {horizon} | {' | '.join(cells)} |")
+        body.append([horizon, *cells])
+    first, *others = BASELINES
+    head = ["horizon", f"trajectory / causal: {first}", *others, "causal, none / fitted",
+            "none / exact", "trajectory, none / causal, exact"]  # fmt: skip
+    print(markdown(head, body))
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained")
     _draw_horizons(axes[0], unbiased)
     _draw_kappas(axes[1], rows[(rows.horizon == KAPPA_HORIZON) & (rows.estimator == "causal")])
@@ -155,7 +161,7 @@ def _ratio(rows: pd.DataFrame, first: tuple[str, str], second: tuple[str, str]) 
     """Return the ratio of two (estimator, baseline)'s variances, MDP by MDP, and its interval."""
     variances = rows.pivot_table(index="seed", columns=["estimator", "baseline"], values="variance")
     ratios = interval(variances[first] / variances[second], statistic=_geometric)
-    return "{:.2f} [{:.2f}, {:.2f}]".format(*ratios)
+    return estimate(ratios, ".2f")
 
 
 def _draw_horizons(axis: Axes, rows: pd.DataFrame) -> None:

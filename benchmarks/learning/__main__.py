@@ -15,23 +15,13 @@ import argparse
 import itertools
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
-import pandas as pd
-
+from benchmarks.common.pool import run_all
 from benchmarks.learning import store
-from benchmarks.learning.pool import run_all
-from benchmarks.learning.run import Run
-from benchmarks.learning.settings import (
-    ALGORITHMS,
-    BUDGETS,
-    RANDOM,
-    describe,
-    parse_setting,
-    resolve,
-    same_hyperparameters,
-    setting_label,
-)
+from benchmarks.learning.run import Run, execute, make_run
+from benchmarks.learning.settings import ALGORITHMS, BUDGETS, RANDOM, TRPO_EQUAL, parse_setting
 
 
 def main() -> None:
@@ -39,9 +29,10 @@ def main() -> None:
     args = _parse_arguments()
     done = store.read_runs(args.results)
     wanted = list(dict.fromkeys(_wanted_runs(args)))
-    missing = [run for run in wanted if not _is_done(run, done)]
+    missing = [run for run in wanted if not store.is_done(run, done)]
     print(f"{len(wanted) - len(missing)} of {len(wanted)} runs are done: {args.results}")
-    if missing and run_all(missing, args.jobs, args.results):
+    keep = partial(store.append, args.results)
+    if missing and run_all(execute, missing, keep, n_processes=args.jobs):
         sys.exit(1)
 
 
@@ -53,8 +44,9 @@ def _parse_arguments() -> argparse.Namespace:
         fromfile_prefix_chars="@",
     )
     names = [*ALGORITHMS, RANDOM]
-    parser.add_argument("--algos", nargs="+", default=names, choices=names, metavar="ALGO",
-                        help=f"default: all of {' '.join(names)}")  # fmt: skip
+    usual = [name for name in names if name != TRPO_EQUAL]
+    parser.add_argument("--algos", nargs="+", default=usual, choices=names, metavar="ALGO",
+                        help=f"default: {' '.join(usual)}")  # fmt: skip
     parser.add_argument("--envs", nargs="+", default=list(BUDGETS), metavar="ENV",
                         help=f"default: {' '.join(BUDGETS)}")  # fmt: skip
     parser.add_argument("--seeds", type=int, default=3, help="seeds 0, …, SEEDS - 1")
@@ -77,23 +69,7 @@ def _wanted_runs(args: argparse.Namespace) -> Iterator[Run]:
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     for seed, env, setting, algo in itertools.product(seeds, args.envs, args.settings, args.algos):
         overrides = parse_setting(setting)
-        entry, arguments = resolve(algo, env, overrides, defaults=args.defaults)
-        yield Run(
-            algo=algo,
-            env=env,
-            setting="" if algo == RANDOM else setting_label(overrides, defaults=args.defaults),
-            timesteps=args.timesteps or BUDGETS[env],
-            seed=seed,
-            hyperparameters=describe(algo, arguments),
-            entry=entry,
-            arguments=arguments,
-        )
-
-
-def _is_done(run: Run, done: pd.DataFrame) -> bool:
-    keys = [getattr(run, name) for name in store.KEYS]
-    rows = done[(done[list(store.KEYS)] == keys).all(axis=1)]
-    return any(same_hyperparameters(run.hyperparameters, row) for row in rows["hyperparameters"])
+        yield make_run(algo, env, seed, overrides, timesteps=args.timesteps, defaults=args.defaults)
 
 
 if __name__ == "__main__":

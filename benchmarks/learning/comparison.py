@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from benchmarks.common.intervals import interval
 from benchmarks.learning import store
 from benchmarks.learning.settings import ALGORITHMS, BUDGETS, RANDOM, same_hyperparameters
-from benchmarks.learning.statistics import Array, bootstrap
+from benchmarks.learning.statistics import Array
 
 METRICS = {"mean_return": "mean return over training", "final_return": "final return"}
 
@@ -117,8 +118,8 @@ class Comparison:
         baseline = self.values(self.baseline, task, column)
         if not len(random) or not len(baseline):
             return False
-        estimate = bootstrap(baseline)
-        low = estimate.low if len(baseline) > 1 else estimate.value
+        found = interval(baseline, method="BCa")
+        low = found.low if len(baseline) > 1 else found.value
         return low > random.mean()
 
     def scores(self, labels: Sequence[str], tasks: Sequence[str], column: str) -> Scores:
@@ -140,7 +141,11 @@ class Comparison:
 
 def load(folder: Path, baseline: str) -> Comparison:
     """Read a results folder."""
-    runs, curves = store.read_runs(folder), store.read_curves(folder)
+    return compare(store.read_runs(folder), store.read_curves(folder), baseline)
+
+
+def compare(runs: pd.DataFrame, curves: pd.DataFrame, baseline: str) -> Comparison:
+    """Return the comparison of rows of runs, of which outdated ones are left out."""
     is_current = _are_current(runs)
     keys = list(store.KEYS)
     curves = curves.merge(runs.loc[is_current, keys], on=keys)

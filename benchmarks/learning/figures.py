@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from benchmarks.common.figures import PALETTE, use_style
+from benchmarks.common.intervals import Estimate
 from benchmarks.learning.comparison import METRICS, Comparison
 from benchmarks.learning.statistics import (
     Array,
-    Estimate,
     improvement,
     interquartile_mean,
     performance_profile,
@@ -22,17 +23,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colours, which the colour-blind can tell apart
-COLOURS = {
-    "CRPN": "#0072B2",
-    "ACRPN": "#56B4E9",
-    "TRPO": "#D55E00",
-    "PPO": "#009E73",
-    "A2C": "#CC79A7",
-    "REINFORCE": "#E69F00",
-    "CRPN-paper": "#000000",
-    "ACRPN-paper": "#7F7F7F",
-}
+COLOURS = dict(
+    zip(
+        ("CRPN", "TRPO", "PPO", "A2C", "REINFORCE", "ACRPN", "CRPN-paper", "ACRPN-paper"),
+        PALETTE,
+        strict=True,
+    )
+)
 DASHED = {"ACRPN", "PPO", "ACRPN-paper", "REINFORCE"}
 
 
@@ -47,8 +44,8 @@ def save_learning_curves(
         ax.set(title=task, xlabel="thousand environment steps")
     axes[0].set_ylabel("return of episodes in training")
     handles, names = axes[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside upper center", ncols=len(names), frameon=False)
-    figure.savefig(path, dpi=150)
+    figure.legend(handles, names, loc="outside upper center", ncols=len(names))
+    figure.savefig(path)
 
 
 def _draw_curve(ax: Axes, comparison: Comparison, label: str, task: str) -> None:
@@ -83,7 +80,7 @@ def save_aggregate(comparison: Comparison, path: Path) -> None:
             if i == 0:
                 _draw_profile(middle, scores[label], label)
     _finish_aggregate(figure, comparison.baseline, labels)
-    figure.savefig(path, dpi=150)
+    figure.savefig(path)
 
 
 def _draw_estimate(ax: Axes, place: float, estimate: Estimate, label: str, *, filled: bool) -> None:
@@ -109,11 +106,9 @@ def _finish_aggregate(figure: Figure, baseline: str, labels: Sequence[str]) -> N
         ax.grid(axis="y", visible=False)
     for filled, name in zip(("k", "white"), METRICS.values(), strict=True):
         left.plot([], [], "o", color="k", mfc=filled, label=name)
-    figure.legend(
-        *left.get_legend_handles_labels(), loc="outside lower left", ncols=2, frameon=False
-    )
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=2)
     figure.legend(*middle.get_legend_handles_labels(), loc="outside lower right",
-                  ncols=len(labels), frameon=False, fontsize="small")  # fmt: skip
+                  ncols=len(labels), fontsize="small")  # fmt: skip
     left.axvline(1, color="0.5", linestyle=":")
     left.set(title="interquartile mean", xlabel=f"score (0: random, 1: {baseline})")
     middle.set(
@@ -127,13 +122,9 @@ def _finish_aggregate(figure: Figure, baseline: str, labels: Sequence[str]) -> N
 
 
 def _figure(n_rows: int, n_columns: int, size: tuple[float, float]) -> tuple[Figure, Any]:
-    import matplotlib as mpl
-
-    mpl.use("Agg")
     from matplotlib import pyplot as plt
 
-    plt.rcParams.update({"axes.spines.top": False, "axes.spines.right": False, "axes.grid": True,
-                         "grid.alpha": 0.3, "font.size": 10})  # fmt: skip
+    use_style()
     figure, axes = plt.subplots(n_rows, n_columns, figsize=size, layout="constrained")
     return figure, np.atleast_1d(axes)
 

@@ -8,7 +8,7 @@ import platform
 import tempfile
 import time
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -17,7 +17,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.learning.settings import ALGORITHMS, RANDOM
+from benchmarks.learning.settings import (
+    ALGORITHMS,
+    BUDGETS,
+    RANDOM,
+    describe,
+    resolve,
+    setting_label,
+)
 from sb3_crpn import zoo
 
 N_BINS = 50  # points of a learning curve
@@ -57,6 +64,41 @@ class Result:
     curve: Sequence[tuple[int, float]]
 
 
+def make_run(
+    algo: str,
+    env: str,
+    seed: int,
+    overrides: Mapping[str, Any],
+    *,
+    timesteps: int | None = None,
+    defaults: bool = False,
+) -> Run:
+    """Return the run of an entry with some hyperparameters overridden.
+
+    Parameters
+    ----------
+    algo, env, seed
+        What tells runs apart.
+    overrides
+        Hyperparameters in place of the entry's.
+    timesteps
+        Budget; ``None``: the benchmark's.
+    defaults
+        Take the constructor's defaults in place of the entry.
+    """
+    entry, arguments = resolve(algo, env, overrides, defaults=defaults)
+    return Run(
+        algo=algo,
+        env=env,
+        setting="" if algo == RANDOM else setting_label(overrides, defaults=defaults),
+        timesteps=timesteps or BUDGETS[env],
+        seed=seed,
+        hyperparameters=describe(algo, arguments),
+        entry=entry,
+        arguments=arguments,
+    )
+
+
 def execute(run: Run) -> Result:
     """Train or, for the random policy, evaluate."""
     if run.env.startswith(("Fetch", "PointMaze")):
@@ -73,7 +115,7 @@ def _train(run: Run) -> Result:
     from stable_baselines3.common.vec_env import sync_envs_normalization
 
     with tempfile.TemporaryDirectory() as folder:
-        manager, model = _set_up(run, Path(folder))
+        manager, model = set_up(run, Path(folder))
         recorder = _episode_recorder(run.timesteps)
         wall, cpu = time.perf_counter(), time.process_time()
         model.learn(run.timesteps, callback=recorder)
@@ -91,6 +133,7 @@ def _train(run: Run) -> Result:
         "final_return": final,
         "steps": steps,
         "episodes": len(recorder.episodes),
+        "updates": recorder.n_rollouts,
         "wall_seconds": wall,
         "cpu_seconds": cpu,
         "versions": versions(),
@@ -98,7 +141,7 @@ def _train(run: Run) -> Result:
     return Result(row, curve)
 
 
-def _set_up(run: Run, folder: Path) -> tuple[Any, Any]:
+def set_up(run: Run, folder: Path) -> tuple[Any, Any]:
     """Return rl-zoo's manager and the model, made from the run's hyperparameters as rl-zoo does."""
     import yaml
     from rl_zoo3.exp_manager import ExperimentManager
@@ -146,6 +189,7 @@ def _episode_recorder(timesteps: int) -> Any:
         def __init__(self) -> None:
             super().__init__()
             self.episodes: list[tuple[int, int, float]] = []
+            self.n_rollouts = 0
 
         def _on_step(self) -> bool:
             # beyond the budget nobody learns: rollouts that overrun it are not trained on
@@ -156,6 +200,9 @@ def _episode_recorder(timesteps: int) -> Any:
                     episode = info["episode"]
                     self.episodes.append((self.num_timesteps, episode["l"], episode["r"]))
             return True
+
+        def _on_rollout_end(self) -> None:
+            self.n_rollouts += 1
 
     return EpisodeRecorder()
 
@@ -224,6 +271,7 @@ def _evaluate_random(run: Run) -> Result:
         "final_return": np.mean(returns),
         "steps": sum(lengths),
         "episodes": len(returns),
+        "updates": 0,
         "wall_seconds": time.perf_counter() - wall,
         "cpu_seconds": time.process_time() - cpu,
         "versions": versions(),

@@ -72,6 +72,15 @@ _NOT_REINFORCE = {
 }  # fmt: skip
 
 
+# TRPO with the settings of CRPN's entry in place of rl-zoo's
+TRPO_EQUAL = "TRPO-equal"
+# An entry's settings that are not the constructor's keyword arguments
+_OF_ENTRY = {*_OF_ENVIRONMENT, "policy", "n_timesteps"}
+# Steps of every episode where nothing but the time limit ends one. CRPN's updates are made of whole
+# episodes, so that they have no fewer steps of each environment.
+_EPISODE_STEPS = {"HalfCheetah-v5": 1000, "Swimmer-v5": 1000}
+
+
 @dataclass(frozen=True)
 class Algorithm:
     """A learner of the benchmark.
@@ -107,6 +116,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     "CRPN-paper": Algorithm("crpn", "crpn_paper.yml", is_paper=True),
     "ACRPN-paper": Algorithm("acrpn", "acrpn_paper.yml", is_paper=True),
     "REINFORCE": Algorithm("reinforce", "crpn.yml"),
+    TRPO_EQUAL: Algorithm("trpo", "crpn.yml"),
     "A2C": Algorithm("a2c", "a2c.yml", is_peer=True),
     "PPO": Algorithm("ppo", "ppo.yml", is_peer=True),
     "TRPO": Algorithm("trpo", "trpo.yml", is_peer=True),
@@ -142,7 +152,27 @@ def resolve(
         name, entry = "defaults", {"policy": "MlpPolicy", **(PAPER if algorithm.is_paper else {})}
     if algo == "REINFORCE":
         entry = {key: value for key, value in entry.items() if key not in _NOT_REINFORCE}
+    elif algo == TRPO_EQUAL:
+        entry = _equal_settings(entry, env_id)
     return name, {**entry, **overrides}
+
+
+def _equal_settings(entry: Mapping[str, Any], env_id: str) -> dict[str, Any]:
+    """Return an entry of CRPN's as TRPO's: the arguments that both constructors have.
+
+    What the entry leaves out is CRPN's default. Both algorithms fit the critic by
+    ``n_critic_updates`` passes over the update's own rollout in minibatches of ``batch_size``, with
+    Adam at ``learning_rate``, so that the same three numbers are the same critic work for each
+    environment step.
+    """
+    defaults = _signature("crpn")
+    shared = defaults.keys() & _signature("trpo").keys() - _NOT_RECORDED
+    settings = {
+        **{key: defaults[key] for key in sorted(shared) if defaults[key] is not None},
+        **{key: value for key, value in entry.items() if key in shared | _OF_ENTRY},
+    }
+    settings["n_steps"] = max(settings["n_steps"], _EPISODE_STEPS.get(env_id, 0))
+    return settings
 
 
 def find_entry(entries: Mapping[str, Any], env_id: str, nearest: Mapping[str, str]) -> str | None:

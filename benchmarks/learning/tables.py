@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from benchmarks.common.intervals import interval
+from benchmarks.common.markdown import estimate, markdown
 from benchmarks.learning.comparison import METRICS, Comparison
 from benchmarks.learning.settings import RANDOM
 from benchmarks.learning.statistics import (
     Array,
-    Estimate,
-    bootstrap,
     improvement,
     interquartile_mean,
     stratified_bootstrap,
@@ -41,8 +41,12 @@ def report(comparison: Comparison) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def aggregate_table(comparison: Comparison, labels: Sequence[str]) -> str:
-    """Return interquartile means of normalised scores and probabilities of improvement."""
+def aggregate_table(
+    comparison: Comparison,
+    labels: Sequence[str],
+    means: Mapping[str, Callable[[Sequence[Array]], float]] = {"IQM": interquartile_mean},
+) -> str:
+    """Return means of normalised scores, by name, and probabilities of improvement."""
     baseline = comparison.baseline
     notes, columns = [], []
     for metric, name in METRICS.items():
@@ -51,14 +55,15 @@ def aggregate_table(comparison: Comparison, labels: Sequence[str]) -> str:
         if not tasks:
             continue
         scores = comparison.scores(labels, tasks, metric)
-        means = [stratified_bootstrap(scores[label], interquartile_mean) for label in labels]
-        columns.append([f"IQM, {name}", *map(_cell, means)])
+        for mean_name, mean in means.items():
+            found = [stratified_bootstrap(scores[label], mean) for label in labels]
+            columns.append([f"{mean_name}, {name}", *map(estimate, found)])
         better = [
-            "-" if label == baseline else _cell(improvement(scores[label], scores[baseline]))
+            "-" if label == baseline else estimate(improvement(scores[label], scores[baseline]))
             for label in labels
         ]
         columns.append([f"P(better than {baseline}), {name}", *better])
-    rows = zip(["algorithm", *labels], *columns, strict=True)
+    head, *body = zip(["algorithm", *labels], *columns, strict=True)
     text = (
         f"Scores are (return - random) / ({baseline} - random): the random policy is 0, "
         f"{baseline}'s mean is 1. Interquartile mean (IQM) and probability of a better run than "
@@ -66,7 +71,7 @@ def aggregate_table(comparison: Comparison, labels: Sequence[str]) -> str:
         f"environments that all of these ran on and where {baseline} is better than random beyond "
         f"chance — {'; '.join(notes)}."
     )
-    return text + "\n\n" + _markdown([list(row) for row in rows])
+    return text + "\n\n" + markdown(head, body)
 
 
 def task_table(comparison: Comparison) -> str:
@@ -79,7 +84,7 @@ def task_table(comparison: Comparison) -> str:
         *METRICS.values(),
         f"steps to {baseline}'s level",
     ]
-    rows = [header]
+    rows: list[list[str]] = []
     for task in comparison.tasks:
         for label in comparison.labels:
             means = comparison.values(label, task, "mean_return")
@@ -94,7 +99,7 @@ def task_table(comparison: Comparison) -> str:
         "when its learning curve, averaged over a tenth of the budget, is. Median over runs "
         f"(how many got there); no level where {baseline} is not better than random."
     )
-    return text + "\n\n" + _markdown(rows)
+    return text + "\n\n" + markdown(header, rows)
 
 
 def cost_table(comparison: Comparison) -> str:
@@ -102,7 +107,7 @@ def cost_table(comparison: Comparison) -> str:
     baseline = comparison.baseline
     header = ["environment", "algorithm", "wall, s", "CPU, s", f"wall / {baseline}'s",
               f"CPU / {baseline}'s"]  # fmt: skip
-    rows = [header]
+    rows: list[list[str]] = []
     for task in comparison.tasks:
         for label in comparison.labels:
             wall = comparison.values(label, task, "wall_seconds")
@@ -110,19 +115,19 @@ def cost_table(comparison: Comparison) -> str:
                 continue
             cells = [mean_cell(wall), mean_cell(comparison.values(label, task, "cpu_seconds"))]
             for column in ("wall_seconds", "cpu_seconds"):
-                cells.append(mean_cell(comparison.paired_ratios(label, task, column), digits=2))
+                cells.append(mean_cell(comparison.paired_ratios(label, task, column), spec=",.2f"))
             rows.append([task, label, *cells])
     text = (
         "Training alone, one thread. Ratios are of runs with the same seed: of one command, they "
         "ran next to each other. Other work on the machine moves wall time, CPU time less."
     )
-    return text + "\n\n" + _markdown(rows)
+    return text + "\n\n" + markdown(header, rows)
 
 
 def entry_table(comparison: Comparison) -> str:
     """Return where the hyperparameters come from."""
     labels, runs = comparison.learners, comparison.runs
-    rows = [["environment", *labels]]
+    rows: list[list[str]] = []
     for task in comparison.tasks:
         entries = [runs[(runs.task == task) & (runs.label == label)].entry for label in labels]
         rows.append([task, *(found.iloc[-1] if len(found) else "-" for found in entries)])
@@ -130,22 +135,14 @@ def entry_table(comparison: Comparison) -> str:
         "File and entry: a2c.yml, ppo.yml and trpo.yml are rl-zoo's; where it has no entry for the "
         "environment, the nearest. The others are this repository's, `zoo_configs/`."
     )
-    return text + "\n\n" + _markdown(rows)
+    return text + "\n\n" + markdown(["environment", *labels], rows)
 
 
-def mean_cell(values: Array, digits: int | None = None) -> str:
+def mean_cell(values: Array, spec: str | None = None) -> str:
     """Return ``mean [low, high]`` of runs; by default with three significant digits."""
     if not len(values):
         return "-"
-    estimate = bootstrap(values)
-    if digits is None:
-        digits = max(0, 2 - int(np.floor(np.log10(max(np.nanmax(np.abs(estimate)), 0.01)))))
-    return _cell(estimate, digits)
-
-
-def _cell(estimate: Estimate, digits: int = 2) -> str:
-    value, low, high = (f"{number:,.{digits}f}" for number in estimate)
-    return value if np.isnan(estimate.low) else f"{value} [{low}, {high}]"
+    return estimate(interval(values, method="BCa"), spec)
 
 
 def _steps_cell(comparison: Comparison, label: str, task: str) -> str:
@@ -154,12 +151,6 @@ def _steps_cell(comparison: Comparison, label: str, task: str) -> str:
         return "-"
     budget = float(comparison.curves[comparison.curves.task == task].steps.max())
     # a bound at the budget means: the budget or more
-    estimate = bootstrap(np.minimum(steps, budget), np.median, "percentile")
-    median = f"> {budget:,.0f}" if np.isinf(np.median(steps)) else _cell(estimate, digits=0)
+    found = interval(np.minimum(steps, budget), statistic=np.median)
+    median = f"> {budget:,.0f}" if np.isinf(np.median(steps)) else estimate(found, ",.0f")
     return f"{median} ({np.isfinite(steps).sum()}/{len(steps)})"
-
-
-def _markdown(rows: list[list[str]]) -> str:
-    header, *body = rows
-    lines = [header, ["---"] * len(header), *body]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)

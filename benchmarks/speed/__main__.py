@@ -4,13 +4,12 @@
     python -m benchmarks.speed products updates     # these alone; the others' results stay
     python -m benchmarks.speed --table              # print, measure nothing
 
-Every part replaces its own results in the JSON file when it is done.
+Every part replaces its own results in the CSV file when it is done.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import platform
 import re
 import time
@@ -21,9 +20,12 @@ from typing import Any
 
 import torch
 
+from benchmarks.common.parts import Parts
+from benchmarks.common.table import Row
 from benchmarks.speed import (
     collection,
     device,
+    many,
     memory,
     products,
     scaling,
@@ -33,20 +35,21 @@ from benchmarks.speed import (
     updates,
 )
 from benchmarks.speed.tables import part_report, report
-from benchmarks.speed.timing import Row, one_thread
+from benchmarks.speed.timing import one_thread
 
 PARTS: dict[str, Callable[..., list[Row]]] = {
     "products": products.measure,
     "updates": updates.measure,
     "collection": collection.measure,
     "stepping": stepping.measure,
+    "many": many.measure,
     "training": training.measure,
     "solves": solves.measure,
     "scaling": scaling.measure,
     "memory": memory.measure,
     "device": device.measure,
 }
-JSON = Path(__file__).with_name("speed.json")
+RESULTS = Path(__file__).with_name("speed.csv")
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -57,18 +60,18 @@ def main(arguments: list[str] | None = None) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}")
-    parser.add_argument("--json", type=Path, default=JSON, metavar="FILE", help="the results")
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="FILE")
     parser.add_argument("--table", action="store_true", help="print the results' tables")
     parser.add_argument("--repeats", type=int, help="turns of each task; default: each part's own")
     args = parser.parse_args(arguments)
     if unknown := [part for part in args.parts if part not in PARTS]:
         parser.error(f"{', '.join(unknown)} is no part, must be of {', '.join(PARTS)}")
     if args.table:
-        print(report(_read(args.json)))
+        print(report(Parts(args.results).read()))
         return
     sizes = {} if args.repeats is None else {"repeats": args.repeats}
     for part in args.parts or PARTS:
-        run_part(part, args.json, **sizes)
+        run_part(part, args.results, **sizes)
 
 
 def run_part(part: str, file: Path, **sizes: Any) -> None:
@@ -76,10 +79,10 @@ def run_part(part: str, file: Path, **sizes: Any) -> None:
     start = time.perf_counter()
     with one_thread():
         rows = PARTS[part](**sizes)
-    result = {"machine": machine(), "seconds": time.perf_counter() - start, "rows": rows}
-    results = _read(file) | {part: result}
-    file.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-    print(part_report(part, result), end="\n\n", flush=True)
+    circumstances = {"machine": machine(), "seconds": time.perf_counter() - start}
+    results = Parts(file)
+    results.replace(part, [circumstances, *rows])
+    print(part_report(part, results.read()[part]), end="\n\n", flush=True)
 
 
 def machine() -> dict[str, str]:
@@ -97,10 +100,6 @@ def _processor() -> str:
     if info.exists() and (found := re.search(r"model name\s*: (.*)", info.read_text())):
         return found[1]
     return platform.processor() or platform.machine()
-
-
-def _read(file: Path) -> dict[str, Any]:
-    return dict(json.loads(file.read_text(encoding="utf-8"))) if file.exists() else {}
 
 
 if __name__ == "__main__":

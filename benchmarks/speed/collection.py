@@ -8,7 +8,8 @@ from sb3_contrib import TRPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from benchmarks.speed.timing import Row, Task, compare
+from benchmarks.common.table import Row
+from benchmarks.speed.timing import Task, compare
 from sb3_crpn import CRPN
 
 TASKS = (("CartPole-v1", 1), ("CartPole-v1", 8), ("Pendulum-v1", 1), ("Pendulum-v1", 8))

@@ -9,9 +9,10 @@ from typing import Any
 
 import torch
 
+from benchmarks.common.table import Row
 from benchmarks.speed.problems import collect, noise_model
 from benchmarks.speed.products import product_tasks
-from benchmarks.speed.timing import Row, Task, compare
+from benchmarks.speed.timing import Task, compare
 from benchmarks.speed.updates import update_task
 from sb3_crpn import CRPN
 from sb3_crpn.sosp import certify_sosp

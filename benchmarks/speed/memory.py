@@ -19,10 +19,10 @@ from typing import Any
 import torch
 from sb3_contrib import TRPO
 
+from benchmarks.common.table import Row
 from benchmarks.speed import scaling
 from benchmarks.speed.problems import collect, noise, noise_model, width_for
 from benchmarks.speed.products import product_tasks
-from benchmarks.speed.timing import Row
 from sb3_crpn import ACRPN, CRPN
 
 PRODUCTS = ("gradient", "Hessian product", "Fisher product")

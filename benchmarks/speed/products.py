@@ -7,8 +7,9 @@ from functools import cache
 
 import torch
 
+from benchmarks.common.table import Row
 from benchmarks.speed.problems import SHAPES, collect, noise_model
-from benchmarks.speed.timing import Row, Task, compare
+from benchmarks.speed.timing import Task, compare
 from sb3_crpn import CRPN
 from sb3_crpn.algorithm import PolicyNewtonAlgorithm
 from sb3_crpn.episodes import EpisodeBatch
@@ -30,7 +31,7 @@ def product_tasks(model: PolicyNewtonAlgorithm, batch: EpisodeBatch) -> dict[str
     Their graphs are kept from one product to the next, so what is timed is each further product;
     where ``max_batch_timesteps`` splits the batch, none are kept.
     """
-    estimate = cache(lambda: model._estimate_from(batch, batch))
+    estimate = cache(lambda: model._estimate_from(batch))
     vector = torch.linspace(-1.0, 1.0, len(model.actor), dtype=torch.float64)
     return {
         "gradient": Task(gradient_of(model, batch)),

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from benchmarks.common.table import Row
 from benchmarks.speed.problems import collect, noise_model, width_for
 from benchmarks.speed.products import product_tasks
-from benchmarks.speed.timing import CLOCKS, Row, interleaved, median, slope
+from benchmarks.speed.timing import CLOCKS, interleaved, median, slope
 from sb3_crpn import CRPN
 
 SHAPE = "HalfCheetah-v5"

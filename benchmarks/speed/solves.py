@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import torch
 
-from benchmarks.speed.timing import Row, Task, compare, interleaved, median, slope
+from benchmarks.common.table import Row
+from benchmarks.speed.timing import Task, compare, interleaved, median, slope
 from sb3_crpn.cubic import solve_dense, solve_krylov
 
 DENSE = (10, 30, 100, 300, 1000, 2000)

@@ -7,7 +7,8 @@ import numpy as np
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
-from benchmarks.speed.timing import Row, Task, compare
+from benchmarks.common.table import Row
+from benchmarks.speed.timing import Task, compare
 from sb3_crpn.vec_env import GymnasiumVecEnv
 
 TASKS = (("CartPole-v1", 8), ("CartPole-v1", 64), ("CartPole-v1", 512))

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from benchmarks.speed.timing import CLOCKS, Row
+from benchmarks.common.markdown import estimate, markdown, number
+from benchmarks.common.table import Row
+from benchmarks.speed.timing import CLOCKS
 
 # Keys of a comparison's row that are not its case
 _RESULTS = ("unit", "repeats", "ms", "ratio")
@@ -15,6 +17,7 @@ TITLES = {
     "updates": "Updates, in TRPO's",
     "collection": "Collection, per simulated step, in SB3's",
     "stepping": "Simulation, per step of an environment, in DummyVecEnv's",
+    "many": "Many environments, per timestep, in TRPO's",
     "training": "Training, per timestep, in TRPO's",
     "solves": "Solves of random cubic models",
     "scaling": "Cost against T and d",
@@ -23,16 +26,17 @@ TITLES = {
 }
 
 
-def report(results: dict[str, Any]) -> str:
+def report(results: dict[str, list[Row]]) -> str:
     """Return the tables of all parts that there are."""
     return "\n\n".join(part_report(part, results[part]) for part in TITLES if part in results)
 
 
-def part_report(part: str, result: Row) -> str:
-    """Return title, machine and tables of one part."""
-    machine = ", ".join(f"{value}" for value in result["machine"].values())
-    return "\n\n".join([f"## {TITLES[part]}", f"{machine}; {result['seconds']:.0f} s.",
-                        *_tables(part, result["rows"])])  # fmt: skip
+def part_report(part: str, results: list[Row]) -> str:
+    """Return title, machine and tables of one part, from its circumstances and its rows."""
+    circumstances, *rows = results
+    machine = ", ".join(f"{value}" for value in circumstances["machine"].values())
+    return "\n\n".join([f"## {TITLES[part]}", f"{machine}; {circumstances['seconds']:.0f} s.",
+                        *_tables(part, rows)])  # fmt: skip
 
 
 def _tables(part: str, rows: list[Row]) -> Iterable[str]:
@@ -59,7 +63,7 @@ def _comparisons(rows: list[Row]) -> str:
             *(row[key] for key in case),
             clock,
             number(row["ms"][unit][clock][0]),
-            *(interval(row["ratio"][name][clock]) for name in names),
+            *(_estimate(row["ratio"][name][clock]) for name in names),
         ]
         for row in rows
         for clock in CLOCKS
@@ -79,7 +83,7 @@ def _scaling(row: Row) -> str:
     ]
     labels = {"slope": "slope", "last slope": "slope of the last two"}
     body += [
-        [label, *(interval(task[key]) for task in tasks.values())] for key, label in labels.items()
+        [label, *(_estimate(task[key]) for task in tasks.values())] for key, label in labels.items()
     ]
     return markdown([row["over"], *(f"{name}, CPU ms" for name in tasks)], body)
 
@@ -87,7 +91,7 @@ def _scaling(row: Row) -> str:
 def _large_solves(row: Row) -> str:
     lines = zip(row["sizes"], row["products"], row["certified"], row["ms"], strict=True)
     body: list[list[Any]] = [[d, n, ok, number(ms[0])] for d, n, ok, ms in lines]
-    body.append(["slope", "", "", interval(row["slope"])])
+    body.append(["slope", "", "", _estimate(row["slope"])])
     return markdown(["d", "products", "certified", "krylov, CPU ms"], body)
 
 
@@ -105,22 +109,5 @@ def _memory(rows: list[Row]) -> str:
     return markdown(["T", "d", "batch", *names], body)
 
 
-def number(value: float) -> str:
-    """Return three significant digits, without an exponent."""
-    return f"{value:.0f}" if value >= 100 else f"{value:#.3g}"
-
-
-def interval(estimate: Sequence[float]) -> str:
-    """Return "median [low, high]"."""
-    middle, low, high = estimate
-    return f"{middle:.2f} [{low:.2f}, {high:.2f}]"
-
-
-def markdown(head: Sequence[Any], body: Iterable[Sequence[Any]]) -> str:
-    """Return a table."""
-    lines = [head, ["---"] * len(head), *body]
-    return "\n".join(f"| {' | '.join(_cell(cell) for cell in line)} |" for line in lines)
-
-
-def _cell(value: Any) -> str:
-    return number(value) if isinstance(value, float) else str(value)
+def _estimate(found: Sequence[float]) -> str:
+    return estimate(found, ".2f")

@@ -13,13 +13,13 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
-from scipy import stats
 
-CONFIDENCE = 0.95
+from benchmarks.common.intervals import interval
+from benchmarks.common.table import Row
+
 WARM_UPS = 2
 CLOCKS: dict[str, Callable[[], float]] = {"cpu": time.process_time, "wall": time.perf_counter}
 
-Row: TypeAlias = dict[str, Any]
 # seconds of each turn, by task and clock
 Times: TypeAlias = dict[str, dict[str, list[float]]]
 
@@ -66,15 +66,8 @@ def one_thread() -> Iterator[None]:
 
 
 def median(values: Sequence[float]) -> list[float]:
-    """Return the sample median and the bounds of its 95 % interval by order statistics.
-
-    The k-th smallest and k-th largest of n independent values miss the true median with
-    probability 2 P(Binomial(n, ½) < k); k is the largest for which that is at most 5 %. Fewer than
-    six values reach no such k: theirs is the whole range.
-    """
-    ordered = np.sort(np.asarray(values, dtype=float))
-    k = max(1, int(stats.binom.ppf((1.0 - CONFIDENCE) / 2.0, len(ordered), 0.5)))
-    return [float(np.median(ordered)), float(ordered[k - 1]), float(ordered[-k])]
+    """Return the sample median and the bounds of its interval."""
+    return list(interval(values, statistic=np.median))
 
 
 def compare(

@@ -9,7 +9,8 @@ import gymnasium as gym
 from sb3_contrib import TRPO
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from benchmarks.speed.timing import Row, Task, compare
+from benchmarks.common.table import Row
+from benchmarks.speed.timing import Task, compare
 from sb3_crpn import ACRPN, CRPN
 
 ENVS = ("CartPole-v1", "Pendulum-v1")

@@ -14,8 +14,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from benchmarks.common.table import Row
 from benchmarks.speed.problems import noise
-from benchmarks.speed.timing import Row, Task, compare
+from benchmarks.speed.timing import Task, compare
 from sb3_crpn import ACRPN, CRPN
 from sb3_crpn.algorithm import PolicyNewtonAlgorithm
 from sb3_crpn.episodes import Replay

@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from sb3_crpn.arrays import Observations
 from sb3_crpn.episodes import EpisodeBatch
-from sb3_crpn.episodes.batch import map_observations
+from sb3_crpn.episodes.observations import map_observations
 from sb3_crpn.parameters import ActorParameters
 from sb3_crpn.policy import state_values
 

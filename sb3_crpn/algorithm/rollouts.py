@@ -6,6 +6,7 @@ import math
 import warnings
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -13,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_crpn.algorithm.distributed_training import DistributedTraining
 from sb3_crpn.algorithm.settings import PolicyNewtonSettings
+from sb3_crpn.arrays import IntArray
 from sb3_crpn.distributed import local_count, world_size
 from sb3_crpn.episodes import (
     Collector,
@@ -39,6 +41,8 @@ class RolloutAlgorithm(OnPolicyAlgorithm, PolicyNewtonSettings):
     _interrupted = False  # where the environments stand is unknown
     _batch_sizes: tuple[int | None, int | None] = (None, None)
     _used_fraction = 1.0
+    _mean_reward = 0.0  # of the last rollout, in the environment's own units
+    _trajectory_times: IntArray | None = None  # where the training environments stand
 
     def _scheduled_episodes(self) -> tuple[int | None, int | None]:
         """Return m_k and b_k of this update, ``None`` where they follow from ``n_steps``."""
@@ -112,14 +116,16 @@ class RolloutAlgorithm(OnPolicyAlgorithm, PolicyNewtonSettings):
         size = RolloutSize(self.n_steps, local_count(n_episodes), self.horizon)
         completed = self._collect_training_rollout(env, callback, rollout_buffer, size)
         lengths = rollout_buffer.lengths
-        stopped, n_simulated, n_segments, n_steps = self.ranks.totals(
-            not completed, self.num_timesteps - before, len(lengths), lengths.sum()
+        simulated = self.num_timesteps - before
+        stopped, n_simulated, n_segments, n_steps, rewards = self.ranks.totals(
+            not completed, simulated, len(lengths), lengths.sum(), self._mean_reward * simulated
         )
         self.num_timesteps = before + int(n_simulated)
         if stopped:
             return False
         self._mean_episode_length = n_steps / n_segments
         self._used_fraction = n_steps / n_simulated
+        self._mean_reward = rewards / n_simulated
         return True
 
     def _collect_training_rollout(
@@ -156,10 +162,9 @@ class RolloutAlgorithm(OnPolicyAlgorithm, PolicyNewtonSettings):
                 completed = collector.collect(buffer, self.tracker, size, on_step)
             finally:
                 self.num_timesteps = collector.timestep
+                self._leave(collector)
             self._interrupted = not completed
-            if completed:
-                self._last_obs = collector.observations
-                self._last_episode_starts = collector.at_episode_start
+            self._mean_reward = collector.mean_reward
         return completed
 
     def _in_rollout(self, env: VecEnv) -> _Rollout:
@@ -176,14 +181,29 @@ class RolloutAlgorithm(OnPolicyAlgorithm, PolicyNewtonSettings):
             sde_sample_freq=self.sde_sample_freq,
         )
         if env is self.env and self._last_obs is not None:
-            collector.stand(self._last_obs, self._last_episode_starts)
-            if self._interrupted:
-                collector.at_episode_start[:] = False
-                if collector.can_reset:
-                    collector.reset()
+            collector.stand(self._last_obs, self._times(env.num_envs))
+            if self._interrupted and collector.can_reset:
+                collector.reset()
         else:
             collector.reset()
         return collector
+
+    def _times(self, n_envs: int) -> IntArray:
+        """Return the time of each training environment's next step in its trajectory, [n_envs].
+
+        Where it is not known, none stands at the start of an episode.
+        """
+        times = self._trajectory_times
+        if times is None or len(times) != n_envs:
+            times = np.ones(n_envs, dtype=np.int64)
+        starts = np.asarray(self._last_episode_starts).astype(np.bool_)
+        return np.maximum(times, 1) if self._interrupted else np.where(starts, 0, times)
+
+    def _leave(self, collector: Collector) -> None:
+        """Remember where the training environments stand."""
+        self._last_obs = collector.observations
+        self._last_episode_starts = collector.at_episode_start
+        self._trajectory_times = collector.times
 
     def _collect_evaluation_episodes(
         self, n_episodes: int, env: VecEnv | None
@@ -210,9 +230,8 @@ class RolloutAlgorithm(OnPolicyAlgorithm, PolicyNewtonSettings):
                 if normalizer is not None:
                     normalizer.training = learns
             if target is self.env:
-                self._last_obs = collector.observations
-                self._last_episode_starts = collector.at_episode_start
-                self._interrupted = not self.tracker.whole_episodes  # their time is unknown
+                self._leave(collector)
+                self._interrupted = False
         return buffer
 
     def _new_buffer(self, n_envs: int) -> EpisodeRolloutBuffer:

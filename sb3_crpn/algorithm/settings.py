@@ -138,12 +138,14 @@ class PolicyNewtonSettings:
         _TRACKER,
         '"episodes": whole episodes, without length bias, and the paper\'s; "timesteps": SB3\'s '
         "``n_steps`` of each environment, which goes on from where it stood, segments bootstrapped "
-        "with V; or a class of :class:`~sb3_crpn.episodes.Tracker`.",
+        "with V and derivatives means over steps, J's divided by a trajectory's mean length "
+        "(DESIGN section 2); or a class of :class:`~sb3_crpn.episodes.Tracker`.",
         "episodes",
     )
     n_episodes: int | Schedule | None = setting(
         COUNT | SCHEDULE | NONE,
-        "m_k, the episodes of the gradient: an int or a schedule; ``None``: from ``n_steps``.",
+        "m_k, the episodes of the gradient: an int or a schedule; ``None``: from ``n_steps``. "
+        'Rollouts of "timesteps" take ``None`` alone.',
         None,
     )
     n_hessian_episodes: int | Schedule | None = setting(
@@ -230,7 +232,7 @@ class PolicyNewtonSettings:
     horizon: int | None = setting(
         COUNT | NONE,
         "H, the step after which whole episodes are cut, in training, estimates and certificates; "
-        "``None``: episodes end by themselves. Timesteps are not cut.",
+        "``None``: episodes end by themselves. Training on timesteps cuts none.",
         None,
     )
     batch_size: int = setting(COUNT, "Minibatch size of the critic.", 128)
@@ -243,8 +245,8 @@ class PolicyNewtonSettings:
     max_batch_timesteps: int | None = setting(
         COUNT | NONE,
         "Maximum number of timesteps whose graphs are held in memory at a time, in chunks of whole "
-        "episodes (at least one episode); ``None``: the whole batch. Batches beyond it cost one "
-        "more forward pass at every product; results are the same to rounding.",
+        "episodes or segments (at least one); ``None``: the whole batch. Batches beyond it cost "
+        "one more forward pass at every product; results are the same to rounding.",
         None,
     )
     use_sde: bool = setting(FLAG, "As in SB3: generalised state-dependent exploration.", False)

@@ -33,7 +33,8 @@ class UpdateStats:
     kl_divergence
         Mean KL(old ‖ new) over states and action components, in nats.
     surrogate_change
-        (1/m) Σ_i A_i (π_new/π_old - 1), a cost: negative is an improvement.
+        (1/m) Σ_i A_i (π_new/π_old - 1), a cost: negative is an improvement. m counts episodes;
+        with rollouts of timesteps, steps.
     policy_objective
         TRPO's: the mean over steps of -A_i π_new/π_old. Positive is good.
     accepted
@@ -52,12 +53,15 @@ class UpdateStats:
         Products with H, or with the metric's generator, spent on the update.
     hessian_shrinkage
         ω.
+    mean_reward
+        Mean reward of a fresh step, in the environment's own units: the learning curve of a task
+        that never ends.
     n_episodes
-        Fresh episodes of all ranks.
+        Fresh episodes of all ranks; with rollouts of timesteps, segments of trajectories.
     n_reused_rollouts
         Earlier rollouts that joined the update.
     used_timesteps_fraction
-        Part of the simulated timesteps that belong to whole episodes.
+        Part of the simulated timesteps that are learnt from.
     explained_variance
         1 - Var[R - V] / Var[R] over the fresh steps; nan where Var[R] = 0.
     target_kl
@@ -86,6 +90,7 @@ class UpdateStats:
     lambda_min: float
     hessian_vector_products: int
     hessian_shrinkage: float
+    mean_reward: float
     n_episodes: int
     n_reused_rollouts: int
     used_timesteps_fraction: float

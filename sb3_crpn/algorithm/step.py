@@ -87,13 +87,10 @@ def take_step(
         step = evaluator.batch.agreed(model.to_parameters(cubic.step))
         return PolicyStep(alpha, cubic, step, evaluator.evaluate(step))
 
-    accepted = False
-    try:
-        trial = attempt(alpha) if target_kl is None else fit_alpha(attempt, alpha, target_kl)
-        if trial.acceptable(target_kl):
-            evaluator.move(trial.step)  # the last trial may have been another
-            accepted = True
-    finally:  # Ctrl-C included: never leave the actor at a trial step
-        if not accepted:
-            evaluator.restore()
+    trial = attempt(alpha) if target_kl is None else fit_alpha(attempt, alpha, target_kl)
+    accepted = trial.acceptable(target_kl)
+    if accepted:
+        evaluator.move(trial.step)  # the last trial may have been another
+    else:
+        evaluator.restore()
     return trial, accepted

@@ -88,7 +88,7 @@ class PolicyNewtonUpdate(RolloutAlgorithm):
         alpha = self._first_alpha(target_kl)
         step, accepted = take_step(evaluator, model, solver, alpha, target_kl)
         value_loss = self._fit_critic(batch, joined)
-        if step.evaluation.finite:  # what spoilt one step would spoil the next ones
+        if step.evaluation.finite:  # a rollout whose step was not finite is not reused
             self.replay.append(batch)
             if target_kl is not None:
                 self.kl_control.alpha = step.alpha
@@ -122,13 +122,7 @@ class PolicyNewtonUpdate(RolloutAlgorithm):
         env = (_VEC_ENV | NONE)("estimate_curvature: env", env)
         share_policy(self.policy)
         batch = self._episode_batch(self._collect_evaluation_episodes(n_episodes, env))
-        return estimate_curvature(
-            self.policy,
-            self.actor,
-            batch,
-            HESSIAN_ESTIMATORS.resolve(self.hessian_estimator, self),
-            max_steps=self.max_batch_timesteps,
-        )
+        return self._estimate_from(batch)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         """Keep the progress of schedules in [0, 1]: whole episodes overrun the last timestep."""
@@ -176,14 +170,22 @@ class PolicyNewtonUpdate(RolloutAlgorithm):
             hessian_batch = concatenate([self._draw(batch, b), *earlier])
         elif b is not None and drawn is not batch:
             hessian_batch = joined
+        return self._estimate_from(
+            joined if drawn is batch else concatenate([drawn, *earlier]),
+            hessian_batch=hessian_batch,
+            fisher_batch=drawn if earlier else None,
+        )
+
+    def _estimate_from(
+        self, batch: EpisodeBatch, **others: EpisodeBatch | None
+    ) -> CurvatureEstimate:
         return estimate_curvature(
             self.policy,
             self.actor,
-            joined if drawn is batch else concatenate([drawn, *earlier]),
+            batch,
             HESSIAN_ESTIMATORS.resolve(self.hessian_estimator, self),
-            hessian_batch=hessian_batch,
-            fisher_batch=drawn if earlier else None,
             max_steps=self.max_batch_timesteps,
+            **others,
         )
 
     def _draw(self, batch: EpisodeBatch, n_episodes: int) -> EpisodeBatch:
@@ -229,7 +231,7 @@ class PolicyNewtonUpdate(RolloutAlgorithm):
     def _fit_critic(self, batch: EpisodeBatch, joined: EpisodeBatch) -> float | None:
         """Regress V on the λ-returns; ``None`` where V is not used.
 
-        The earlier rollouts share in the minibatches of the fresh one, which become no more.
+        Reused rollouts share the minibatches of the fresh one: their number does not grow.
         """
         if not self.uses_critic:
             return None
@@ -247,6 +249,7 @@ class PolicyNewtonUpdate(RolloutAlgorithm):
         log_std = getattr(self.policy, "log_std", None)
         return {
             "n_updates": self._n_updates,
+            "mean_reward": self._mean_reward,
             "n_episodes": batch.total_episodes,
             "used_timesteps_fraction": self._used_fraction,
             "explained_variance": _explained_variance(batch),
@@ -270,7 +273,7 @@ def _step_statistics(
         "step_norm": float(step.step.norm()) if accepted else 0.0,
         "kl_divergence": step.kl if accepted else 0.0,
         "surrogate_change": change,
-        "policy_objective": -mean_cost - change * batch.total_episodes / batch.total_steps,
+        "policy_objective": -mean_cost - change * batch.total_size / batch.total_steps,
         "accepted": accepted,
         "certified": cubic.certified,
         "solver_status": cubic.status,

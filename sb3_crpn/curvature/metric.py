@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import torch
 
+from sb3_crpn.checks import POSITIVE
 from sb3_crpn.curvature.estimate import CurvatureEstimate
 from sb3_crpn.curvature.operator import GroupedOperator
 from sb3_crpn.curvature.registry import Registry
@@ -56,10 +56,7 @@ class Fisher:
     damping: float = 0.1
 
     def __post_init__(self) -> None:
-        if not (self.damping > 0.0 and math.isfinite(self.damping)):
-            raise ValueError(
-                f"damping={self.damping!r} is not allowed, must be a finite number > 0"
-            )
+        POSITIVE("Fisher: damping", self.damping)
 
     def generator(self, estimate: CurvatureEstimate) -> GroupedOperator:
         """Return the Fisher matrix."""

@@ -8,6 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from sb3_crpn.arrays import FloatArray, IntArray
+from sb3_crpn.checks import FRACTION
 from sb3_crpn.curvature.registry import Registry
 from sb3_crpn.episodes.batch import episode_scan, episode_starts
 
@@ -52,8 +53,7 @@ class Causal:
     decay: float = 1.0
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.decay <= 1.0:
-            raise ValueError(f"decay={self.decay!r} is not allowed, must be in [0, 1]")
+        FRACTION("Causal: decay", self.decay)
 
     def apply(self, cost_advantages: FloatArray, lengths: IntArray, u: FloatArray) -> FloatArray:
         """Return Wu by two linear recursions."""

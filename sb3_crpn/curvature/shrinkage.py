@@ -8,6 +8,7 @@ from typing import Protocol, runtime_checkable
 
 import torch
 
+from sb3_crpn.checks import FRACTION
 from sb3_crpn.curvature.registry import Registry
 
 
@@ -35,8 +36,7 @@ class Constant:
     value: float = 1.0
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.value <= 1.0:
-            raise ValueError(f"value={self.value!r} is not allowed, must be in [0, 1]")
+        FRACTION("Constant: value", self.value)
 
     def factor(self, hessians: torch.Tensor, weights: torch.Tensor) -> float:
         """Return ``value``."""

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
-from sb3_crpn.arrays import Array, BoolArray, FloatArray, Observations
+from sb3_crpn.arrays import Array, BoolArray, FloatArray, IntArray, Observations
 from sb3_crpn.episodes.buffer import EpisodeRolloutBuffer
+from sb3_crpn.episodes.observations import all_finite, as_arrays, as_observation
 from sb3_crpn.episodes.running_moments import RunningMoments
 from sb3_crpn.episodes.tracker import RolloutSize, Segment, Tracker
 from sb3_crpn.policy import environment_actions, sample_actions, to_tensor
@@ -61,8 +61,11 @@ class Collector:
 
     Attributes
     ----------
-    observations, at_episode_start
-        Where the environments stand, [n_envs, …] and [n_envs].
+    observations, times
+        Where the environments stand, [n_envs, …], and the time of each one's next step in its
+        trajectory, [n_envs]: 0 after a reset.
+    mean_reward
+        The mean over the steps of the last rollout, in the environment's own units.
     timestep
         Steps of all environments so far, for messages.
     """
@@ -78,8 +81,9 @@ class Collector:
     ) -> None:
         self.policy, self.env = policy, env
         self.observations: Any = None
-        self.at_episode_start: BoolArray = np.ones(env.num_envs, dtype=np.bool_)
+        self.times: IntArray = np.zeros(env.num_envs, dtype=np.int64)
         self.timestep = 0
+        self.mean_reward = 0.0
         self._endless_after = self._warn_after = ENDLESS
         self._bootstrap_truncated = bootstrap_truncated
         self._uses_critic = uses_critic
@@ -90,20 +94,25 @@ class Collector:
         self._raw_rewards = _raw_rewards(normalizer)
         self._start_time = time.time()
 
-    def stand(self, observations: Any, at_episode_start: Any) -> None:
+    @property
+    def at_episode_start(self) -> BoolArray:
+        """Whether each environment stands at the start of a trajectory, [n_envs]."""
+        starts: BoolArray = self.times == 0
+        return starts
+
+    def stand(self, observations: Any, times: IntArray) -> None:
         """Say where the environments stand; ``None``: reset them."""
         if observations is None:
             self.reset()
             return
-        self.observations = _as_arrays(observations)
-        self.at_episode_start = np.asarray(at_episode_start).astype(np.bool_)
+        self.observations, self.times = as_arrays(observations), times
         self._require_finite("observation", self.observations)
 
     def reset(self) -> None:
         """Reset all environments."""
         before = None if self._moments is None else self._moments.snapshot()
-        self.observations = _as_arrays(self.env.reset())
-        self.at_episode_start = np.ones(self.env.num_envs, dtype=np.bool_)
+        self.observations = as_arrays(self.env.reset())
+        self.times = np.zeros(self.env.num_envs, dtype=np.int64)
         self._require_finite("observation", self.observations, before)
 
     def expect_an_end_within(self, n_steps: int) -> None:
@@ -134,36 +143,33 @@ class Collector:
         """
         if tracker.whole_episodes and self.can_reset and not self.at_episode_start.all():
             self.reset()
-        tracker.begin(size, self.at_episode_start)
+        tracker.begin(size, self.times)
         buffer.reset()
         self._n_steps = self._last_end = 0
-        self._returns = np.zeros(self.env.num_envs)
+        self._returns, self._reward_sum = np.zeros(self.env.num_envs), 0.0
         unknown = torch.zeros(self.env.num_envs)  # V and log π: evaluated at the end, all at once
         while not tracker.complete:
             self._draw_noise()
+            observations, starts = self.observations, self.at_episode_start
             transition = self._step()
             recording = tracker.recording
             segments = list(tracker.advance(transition.dones))
-            if size.horizon is not None:
-                self._report_cut_episodes(segments, recording, transition)
+            raw_rewards = self._raw_rewards(transition.rewards)
+            self._reward_sum += float(raw_rewards.sum())
+            if size.horizon is not None and tracker.whole_episodes:
+                self._report_cut_episodes(segments, recording, transition, raw_rewards)
             if not on_step(transition):
                 return False
-            buffer.add(
-                self.observations,
-                transition.actions,
-                transition.rewards,
-                self.at_episode_start,
-                unknown,
-                unknown,
-            )
+            actions, rewards = transition.actions, transition.rewards
+            buffer.add(observations, actions, rewards, starts, unknown, unknown)
             for segment in segments:
                 buffer.close(segment, self._next_observation(segment, tracker, transition))
-            self.observations, self.at_episode_start = transition.new_obs, transition.dones
             if tracker.needs_reset and self.can_reset:
                 self.reset()
                 tracker.restart()
             if tracker.whole_episodes:
                 self._require_progress(segments)
+        self.mean_reward = self._reward_sum / (self._n_steps * self.env.num_envs)
         buffer.finish(self.policy if self._uses_critic else None, self.observations)
         return True
 
@@ -184,18 +190,14 @@ class Collector:
         new_obs, rewards, dones, infos = self.env.step(clipped_actions)
         self._n_steps += 1
         self.timestep += self.env.num_envs
-        new_obs, rewards = _as_arrays(new_obs), np.asarray(rewards)
+        new_obs, rewards = as_arrays(new_obs), np.asarray(rewards)
         self._require_finite("reward", rewards, before)
         self._require_finite("observation", new_obs, before)
+        dones = np.asarray(dones).astype(np.bool_)
+        # at once: whatever interrupts the rollout from here on, this is where they stand
+        self.observations, self.times = new_obs, np.where(dones, 0, self.times + 1)
         return Transition(
-            self._n_steps,
-            obs_tensor,
-            actions,
-            clipped_actions,
-            new_obs,
-            rewards,
-            np.asarray(dones).astype(np.bool_),
-            infos,
+            self._n_steps, obs_tensor, actions, clipped_actions, new_obs, rewards, dones, infos
         )
 
     def _next_observation(self, segment: Segment, tracker: Tracker, transition: Transition) -> Any:
@@ -220,11 +222,14 @@ class Collector:
         return last_obs
 
     def _report_cut_episodes(
-        self, segments: list[Segment], recording: BoolArray, transition: Transition
+        self,
+        segments: list[Segment],
+        recording: BoolArray,
+        transition: Transition,
+        raw_rewards: FloatArray,
     ) -> None:
         """Report an episode that the horizon cut as ``Monitor`` would, and only those recorded."""
-        rewards = self._raw_rewards()
-        self._returns += transition.rewards if rewards is None else rewards
+        self._returns += raw_rewards
         for env in np.flatnonzero(~recording & transition.dones):
             transition.infos[env].pop("episode", None)
         for segment in segments:
@@ -268,34 +273,6 @@ class Collector:
             )
 
 
-def all_finite(value: Any) -> bool:
-    """Tell whether an array, or each one of a dict, is free of NaN and infinity."""
-    arrays = value.values() if isinstance(value, dict) else (value,)
-    return all(
-        np.isfinite(array).all() for array in arrays if np.issubdtype(array.dtype, np.floating)
-    )
-
-
-def as_observation(space: spaces.Space[Any], observation: Any) -> Any:
-    """Return one observation as an array of the space's shape and dtype, or a dict of them.
-
-    Environments may return Python numbers, lists, or dicts of such.
-    """
-    if isinstance(space, spaces.Dict):
-        return {
-            key: as_observation(subspace, observation[key])
-            for key, subspace in space.spaces.items()
-        }
-    return np.asarray(observation, dtype=space.dtype).reshape(space.shape or ())
-
-
-def _as_arrays(observations: Any) -> Any:
-    """Return a batch of observations as an array, or a dict of arrays."""
-    if isinstance(observations, dict):
-        return {key: np.asarray(array) for key, array in observations.items()}
-    return np.asarray(observations)
-
-
 def _early_resets_allowed(env: VecEnv) -> bool:
     """Whether every environment may be reset in mid-episode: SB3's ``Monitor`` can forbid it.
 
@@ -316,8 +293,8 @@ def _early_resets_allowed(env: VecEnv) -> bool:
     return True
 
 
-def _raw_rewards(normalizer: VecNormalize | None) -> Callable[[], FloatArray | None]:
-    """Return a function that gives the last step's rewards before ``VecNormalize`` scaled them."""
+def _raw_rewards(normalizer: VecNormalize | None) -> Callable[[FloatArray], FloatArray]:
+    """Return what turns the last step's rewards into those before ``VecNormalize`` scaled them."""
     if normalizer is None or not normalizer.norm_reward:
-        return lambda: None
-    return normalizer.get_original_reward
+        return lambda rewards: rewards
+    return lambda rewards: normalizer.get_original_reward()

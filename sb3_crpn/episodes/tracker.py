@@ -61,8 +61,8 @@ class Tracker(Protocol):
 
     whole_episodes: ClassVar[bool]
 
-    def begin(self, size: RolloutSize, at_episode_start: BoolArray) -> None:
-        """Begin a rollout; ``at_episode_start``, [n_envs]: where the environments stand."""
+    def begin(self, size: RolloutSize, times: IntArray) -> None:
+        """Begin a rollout; ``times``, [n_envs]: of each next step in its trajectory, from 0."""
 
     @property
     def complete(self) -> bool:
@@ -105,10 +105,10 @@ class EpisodeTracker:
     """Keeps a fixed quota of whole episodes from each environment, without length bias.
 
     Taking the first m episodes to finish over parallel environments favours short ones. Here each
-    environment delivers its first q_e episodes, however long they take; q_e is fixed before the
-    rollout starts. What an environment runs beyond its quota is thrown away. An environment is
-    *recording* an episode, *waiting* for its next one to start (it is in the middle of an episode
-    that does not count), or has met its quota.
+    environment delivers its first q_e episodes, whatever their length; q_e is fixed before the
+    rollout starts. Steps beyond the quota are not learnt from. An environment *records* an
+    episode, *waits* for its next one to start (the present one began before the rollout, or was
+    cut), or has met its quota.
     """
 
     whole_episodes: ClassVar[bool] = True
@@ -116,14 +116,15 @@ class EpisodeTracker:
     def __init__(self) -> None:
         self._n_ended = np.zeros(0, dtype=np.int64)
 
-    def begin(self, size: RolloutSize, at_episode_start: BoolArray) -> None:
+    def begin(self, size: RolloutSize, times: IntArray) -> None:
         """Begin a rollout of ``size.n_episodes``, each cut after ``size.horizon`` steps."""
-        if len(self._n_ended) != len(at_episode_start):
-            self._n_ended = np.zeros(len(at_episode_start), dtype=np.int64)
-        self._remaining = episodes_per_env(size.n_episodes, len(at_episode_start))
+        n_envs = len(times)
+        if len(self._n_ended) != n_envs:
+            self._n_ended = np.zeros(n_envs, dtype=np.int64)
+        self._remaining = episodes_per_env(size.n_episodes, n_envs)
         self._horizon = np.inf if size.horizon is None else size.horizon
-        self._recording = at_episode_start & (self._remaining > 0)
-        self._length = np.zeros(len(at_episode_start), dtype=np.int64)
+        self._recording: BoolArray = (times == 0) & (self._remaining > 0)
+        self._length = np.zeros(n_envs, dtype=np.int64)
         self._step = 0
 
     @property
@@ -163,23 +164,22 @@ class EpisodeTracker:
 class TimestepTracker:
     """Keeps ``n_steps`` steps of each environment, which goes on from where it stood.
 
-    It remembers the age and the number of each environment's trajectory from one rollout to the
-    next. ``horizon`` means nothing to it.
+    A trajectory that goes on in the next rollout keeps its number. ``horizon`` means nothing here.
     """
 
     whole_episodes: ClassVar[bool] = False
 
     def __init__(self) -> None:
-        self._age = self._number = np.zeros(0, dtype=np.int64)
+        self._times = self._numbers = np.zeros(0, dtype=np.int64)
 
-    def begin(self, size: RolloutSize, at_episode_start: BoolArray) -> None:
+    def begin(self, size: RolloutSize, times: IntArray) -> None:
         """Begin a rollout of ``size.n_steps`` steps of each environment."""
-        n_envs = len(at_episode_start)
-        if len(self._age) != n_envs:
-            self._age, self._number = np.zeros((2, n_envs), dtype=np.int64)
-        self._age = np.where(at_episode_start, 0, self._age)
-        self._number = self._number + at_episode_start
-        self._length = np.zeros(n_envs, dtype=np.int64)
+        n_envs = len(times)
+        if len(self._times) != n_envs:
+            self._times, self._numbers = np.zeros((2, n_envs), dtype=np.int64)
+        # an environment that does not stand where the last rollout left it was used elsewhere
+        self._numbers = self._numbers + (times != self._times)
+        self._times, self._length = times.copy(), np.zeros(n_envs, dtype=np.int64)
         self._n_steps, self._step = size.n_steps, 0
 
     @property
@@ -195,25 +195,26 @@ class TimestepTracker:
     @property
     def recording(self) -> BoolArray:
         """Every step counts, [n_envs]."""
-        return np.ones(len(self._age), dtype=np.bool_)
+        return np.ones(len(self._times), dtype=np.bool_)
 
     def advance(self, dones: BoolArray) -> Iterator[Segment]:
         """Take note of one step of every environment and yield the segments that it ended."""
         self._step += 1
+        self._times += 1
         self._length += 1
         ended = np.ones_like(dones) if self.complete else dones
         for env in np.flatnonzero(ended):
-            length, age = int(self._length[env]), int(self._age[env])
-            cut, number = not dones[env], int(self._number[env])
-            yield Segment(int(env), self._step - length, length, cut, age, number)
-        self._age = np.where(dones, 0, self._age + self._length * ended)
-        self._number = self._number + dones
+            length, number = int(self._length[env]), int(self._numbers[env])
+            first = int(self._times[env]) - length
+            yield Segment(int(env), self._step - length, length, not dones[env], first, number)
         self._length[ended] = 0
+        self._times[dones] = 0
+        self._numbers += dones
 
     def restart(self) -> None:
         """Take note that all environments were reset."""
-        self._age[:] = self._length[:] = 0
-        self._number += 1
+        self._times[:] = self._length[:] = 0
+        self._numbers += 1
 
 
 TRACKERS: dict[str, Callable[[], Tracker]] = {

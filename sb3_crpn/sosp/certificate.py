@@ -27,7 +27,9 @@ from sb3_crpn.checks import (
     real,
     requires,
 )
-from sb3_crpn.episodes.batch import map_observations
+from sb3_crpn.episodes.batch import EpisodeBatch
+from sb3_crpn.episodes.observations import map_observations
+from sb3_crpn.parameters import ActorParameters
 from sb3_crpn.policy import find_actor
 from sb3_crpn.sosp.batch_means import BatchMeans
 from sb3_crpn.sosp.episodes import collect_episodes, preserve_state, with_baseline
@@ -141,35 +143,21 @@ def certify_sosp(
         seed=seed,
     )
     confidence, interval, bounds = (checked[k] for k in ("confidence", "interval", "bounds"))
-    policy, target = (
-        _policy(model),
-        _environment(model, env),
-    )
+    lanczos = {"n_probes": checked["n_probes"], "n_leftmost": checked["n_eigenvalues"]}
+    policy, target = _policy(model), _environment(model, env)
     rng = np.random.default_rng(checked["seed"])
     n_blocks, n_episodes = _blocks(checked["n_episodes"])
     with preserve_state(policy, target, int(rng.integers(2**31))):
-        horizon = getattr(model, "horizon", None)
-        batch = collect_episodes(policy, target, n_episodes, gamma=model.gamma, horizon=horizon)
-        if interval == "bootstrap":
-            batch = with_baseline(policy, batch, model.gamma)
-        first = map_observations(batch.observations, lambda tensor: tensor[:1])
-        sample = BatchMeans.from_episodes(
-            policy, find_actor(policy, first), batch, n_blocks, model.gamma, rng
-        )
+        batch = _simulate(model, policy, target, n_episodes, baseline=interval == "bootstrap")
+        actor = _actor(policy, batch)
+        sample = BatchMeans.from_episodes(policy, actor, batch, n_blocks, model.gamma, rng)
         generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
-        spectrum = lanczos_spectrum(
-            sample.mean_product,
-            sample.gradients[0],
-            generator,
-            n_probes=checked["n_probes"],
-            n_leftmost=checked["n_eigenvalues"],
-        )
-        if interval == "bootstrap":
+        spectrum = lanczos_spectrum(sample.mean_product, sample.gradients[0], generator, **lanczos)
+        if bounds is None:
             intervals = bootstrap_intervals(sample, spectrum, confidence, generator, rng)
-        else:
-            assert bounds is not None  # by checked_options
+        else:  # of "bernstein", by checked_options
             intervals = bernstein_intervals(sample, spectrum, confidence, bounds, n_episodes)
-    gradient, direction = sample.gradients.mean(0), spectrum.vector
+    gradient = sample.gradients.mean(0)
     return SospReport(
         *intervals,
         epsilon=checked["epsilon"],
@@ -179,9 +167,32 @@ def certify_sosp(
         n_episodes=n_episodes,
         n_steps=batch.n_steps,
         gradient=gradient,
-        escape_direction=-direction if gradient @ direction > 0.0 else direction,
+        escape_direction=_downhill(gradient, spectrum.vector),
         spectrum=spectrum,
     )
+
+
+def _simulate(
+    model: OnPolicyAlgorithm,
+    policy: ActorCriticPolicy,
+    env: VecEnv,
+    n_episodes: int,
+    *,
+    baseline: bool,
+) -> EpisodeBatch:
+    """Return episodes end to end, their costs-to-go less the model's critic if ``baseline``."""
+    horizon = getattr(model, "horizon", None)
+    batch = collect_episodes(policy, env, n_episodes, gamma=model.gamma, horizon=horizon)
+    return with_baseline(policy, batch, model.gamma) if baseline else batch
+
+
+def _actor(policy: ActorCriticPolicy, batch: EpisodeBatch) -> ActorParameters:
+    first = map_observations(batch.observations, lambda tensor: tensor[:1])
+    return find_actor(policy, first)
+
+
+def _downhill(gradient: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
+    return -direction if gradient @ direction > 0.0 else direction
 
 
 def _blocks(n_episodes: int) -> tuple[int, int]:

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -74,21 +76,15 @@ def test_alpha_that_is_given_is_tried_once(attempt):
     assert evaluator.n_trials == 1
 
 
-@pytest.mark.parametrize("where", ["solve", "evaluate", "move"])
-def test_an_interrupt_anywhere_leaves_the_actor_as_it_was(attempt, where, monkeypatch):
+def test_a_step_that_raises_the_surrogate_is_taken_back(attempt, monkeypatch):
     actor, evaluator, model = attempt
-    origin, solver = actor.snapshot(), Recorded()
-    owner = solver if where == "solve" else evaluator
-    original, calls = getattr(owner, where), []
+    origin, evaluate = actor.snapshot(), evaluator.evaluate
 
-    def interrupted(*arguments):
-        result = original(*arguments)
-        calls.append(arguments)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return result
+    def uphill(step):
+        return replace(evaluate(step), surrogate_change=1e-12)
 
-    monkeypatch.setattr(owner, where, interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        take_step(evaluator, model, solver, 1e3, TARGET)
+    monkeypatch.setattr(evaluator, "evaluate", uphill)
+    step, accepted = take_step(evaluator, model, DenseSolver(), 1.0, TARGET)
+    assert not accepted
+    assert step.kl > 0.0
     assert all(torch.equal(a, b) for a, b in zip(actor.tensors, origin, strict=True))

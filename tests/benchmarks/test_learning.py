@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import warnings
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -10,12 +11,14 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from benchmarks.learning import comparison, report, store, tables
+from benchmarks.common.intervals import interval
+from benchmarks.learning import comparison, equal, report, rollouts, store, tables
 from benchmarks.learning.__main__ import main
-from benchmarks.learning.run import N_BINS, Result, Run, learning_curve
+from benchmarks.learning.run import N_BINS, Result, Run, learning_curve, make_run
 from benchmarks.learning.settings import (
     ALGORITHMS,
     BUDGETS,
+    TRPO_EQUAL,
     describe,
     find_entry,
     parse_setting,
@@ -24,9 +27,9 @@ from benchmarks.learning.settings import (
     setting_label,
 )
 from benchmarks.learning.statistics import (
-    bootstrap,
     improvement,
     interquartile_mean,
+    mean_score,
     performance_profile,
     stratified_bootstrap,
 )
@@ -125,6 +128,98 @@ def test_reinforce_has_crpns_entry_without_what_only_newton_steps_use() -> None:
     assert "actor_learning_rate=" in describe("REINFORCE", reinforce)
 
 
+def test_trpo_at_equal_settings_has_crpns_entry_and_defaults() -> None:
+    entry, arguments = resolve(TRPO_EQUAL, "CartPole-v1", {})
+    assert entry == "crpn.yml: CartPole-v1"
+    crpn = describe("CRPN", resolve("CRPN", "CartPole-v1", {})[1])
+    trpo = describe(TRPO_EQUAL, arguments)
+    assert same_hyperparameters(crpn, trpo)
+    shared = ("n_envs", "n_steps", "gamma", "gae_lambda", "target_kl", "normalize", "batch_size",
+              "n_critic_updates", "learning_rate", "policy_kwargs", "use_sde")  # fmt: skip
+    assert all(f"{name}=" in crpn and f"{name}=" in trpo for name in shared)
+    assert "krylov_dim" not in trpo
+    # episodes of 1,000 steps: as many in an update of CRPN
+    assert resolve("CRPN", "HalfCheetah-v5", {})[1]["n_steps"] == 512
+    assert resolve(TRPO_EQUAL, "HalfCheetah-v5", {})[1]["n_steps"] == 1000
+
+
+def test_the_arms_at_equal_settings() -> None:
+    runs = list(equal.wanted_runs(["CartPole-v1", "Walker2d-v5"]))
+    arms = {(run.env, run.algo, run.setting) for run in runs}
+    without = "hessian_shrinkage=0.0"
+    cartpole = {("CRPN", ""), ("CRPN", without), ("ACRPN", ""), (TRPO_EQUAL, "")}
+    # Walker2d's entry has no Hessian: the same run
+    expected = {("CartPole-v1", *arm) for arm in cartpole}
+    expected |= {("Walker2d-v5", *arm) for arm in cartpole - {("CRPN", without)}}
+    assert arms == expected
+    assert len(runs) == 4 * 10 + 3 * 5
+    assert sorted(env for stage, _ in equal.STAGES for env in stage) == sorted(BUDGETS)
+
+
+def test_the_report_at_equal_settings_has_the_seeds_that_all_arms_have(tmp_path: Path) -> None:
+    peers, folder = tmp_path / "peers", tmp_path / "equal"
+    for run in equal.wanted_runs(["CartPole-v1", "Walker2d-v5"], 1000):
+        if run.seed < 3 - (run.algo == "ACRPN"):
+            of_peers = run.algo == "ACRPN"  # rows without a number of updates
+            level = {"ACRPN": 40.0, "CRPN": 60.0, TRPO_EQUAL: 50.0}[run.algo]
+            result = _result(level + run.seed, np.array([1.0]))
+            store.append(peers if of_peers else folder, run, result)
+    other = make_run("CRPN", "CartPole-v1", 0, {"gamma": 0.5}, timesteps=1000)
+    store.append(folder, other, _result(9.0, np.array([1.0])))
+    for seed in range(4):
+        random = make_run("Random", "CartPole-v1", seed, {}, timesteps=1000)
+        store.append(peers, random, _result(0.0, np.array([])))
+    found = equal.load((peers, folder), 1000)
+    assert found.complete_learners == found.learners
+    task = "CartPole-v1 (1,000 steps)"
+    arms = ["CRPN", "CRPN (hessian_shrinkage=0.0)", "ACRPN", TRPO_EQUAL]
+    assert sorted(found.learners) == sorted(arms)
+    for arm in arms:
+        assert found.values(arm, task, "seed").tolist() == [0, 1]
+    walker = "Walker2d-v5 (1,000 steps)"
+    np.testing.assert_array_equal(found.values(arms[1], walker, "mean_return"), [60, 61])
+    text = equal.report(found)
+    assert "| CRPN | 1.20 [" in text  # 60.5 / 50.5
+    assert f"| {task} | 33,333 | 33,333 | 33,333 | 33,333 |" in text
+
+
+def test_rollouts_differ_in_nothing_else() -> None:
+    runs = rollouts.wanted_runs()
+    pairs = list(zip(runs[::2], runs[1::2], strict=True))
+    assert len(set(runs)) == len(runs)
+    for episodes, timesteps in pairs:
+        same = ("env", "seed", "timesteps", "entry")
+        assert all(getattr(episodes, name) == getattr(timesteps, name) for name in same)
+        ours, theirs = episodes.hyperparameters, timesteps.hyperparameters
+        assert ours.replace("rollout=episodes", "rollout=timesteps") == theirs != ours
+    many = [run for run, _ in pairs if run.arguments.get("n_envs") == 16]
+    assert {(run.env, run.arguments["n_steps"]) for run in many} == {
+        ("CartPole-v1", 32),
+        ("Pendulum-v1", 50),
+        ("HalfCheetah-v5", 64),
+        ("Hopper-v5", 128),
+    }
+
+
+def test_the_table_of_rollouts() -> None:
+    runs = pd.DataFrame(
+        {
+            "env": "CartPole-v1",
+            "timesteps": 100,
+            "setting": ["", "", "n_envs=16,n_steps=32,rollout=timesteps"],
+            "mean_return": [10.0, 30.0, 5.0],
+            "final_return": [20.0, 20.0, 7.0],
+            "episodes": [4, 6, 8],
+            "cpu_seconds": [1.0, 3.0, 5.0],
+        }
+    )
+    lines = rollouts.table(runs).splitlines()[2:]
+    assert lines == [
+        "| CartPole-v1 | 100 | 16 | timesteps | 1 | 5 | 7 | 8 | 5 |",
+        "| CartPole-v1 | 100 | entry's | episodes | 2 | 20 [10, 30] | 20 [20, 20] | 5 | 2 |",
+    ]
+
+
 def test_a_new_argument_does_not_make_another_run_but_another_value_does() -> None:
     assert same_hyperparameters("a=1; b=2", "a=1; b=2; c=3")
     assert not same_hyperparameters("a=1; b=2", "a=1; b=3")
@@ -137,7 +232,7 @@ def _run(algo: str, seed: int, hyperparameters: str = "a=1", env: str = "CartPol
 
 def _result(mean: float, curve: np.ndarray) -> Result:
     row = {"mean_return": mean, "final_return": 2 * mean, "steps": 100_000, "episodes": 9,
-           "wall_seconds": 3.0, "cpu_seconds": 2.0, "versions": ""}  # fmt: skip
+           "updates": 3, "wall_seconds": 3.0, "cpu_seconds": 2.0, "versions": ""}  # fmt: skip
     steps = np.linspace(0, 100_000, len(curve) + 1)[1:]
     return Result(row, [(int(s), float(v)) for s, v in zip(steps, curve, strict=True)])
 
@@ -239,18 +334,42 @@ def test_performance_profile_is_a_fraction_of_runs() -> None:
     np.testing.assert_allclose(profile, [1, 0.75, 0])
 
 
-def test_intervals() -> None:
+def test_stratified_intervals_of_one_environment_are_plain_ones() -> None:
     values = np.random.default_rng(2).normal(size=400)
-    mean, low, high = bootstrap(values)
-    assert low < mean < high
-    assert high - low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.1)
-    assert stratified_bootstrap([values], lambda s: float(s[0].mean())) == pytest.approx(
-        (mean, low, high), abs=0.01
-    )
-    assert bootstrap(np.full(3, 5.0)) == (5, 5, 5)
-    alone = bootstrap(np.array([5.0]))
-    assert alone.value == 5
-    assert np.isnan(alone.low)
+    found = stratified_bootstrap([values], lambda s: float(s[0].mean()))
+    assert found == pytest.approx(interval(values), abs=0.01)
+
+
+def test_one_seed_an_environment_has_no_interval() -> None:
+    value, low, high = stratified_bootstrap([np.ones(1), np.zeros(1)], mean_score)
+    assert value == 0.5
+    assert np.isnan([low, high]).all()
+
+
+def test_the_mean_score_weighs_environments_alike() -> None:
+    assert mean_score([np.array([1.0, 3.0]), np.array([8.0])]) == 5.0
+
+
+@pytest.mark.skipif(find_spec("rliable") is None, reason="needs the zoo extra")
+def test_statistics_are_rliables() -> None:
+    from rliable import library, metrics
+
+    rng = np.random.default_rng(0)
+    scores, others = rng.normal(size=(2, 10, 8)), rng.normal(0.3, 1, size=(10, 8))
+    ours = list(scores[0].T)
+    assert interquartile_mean(ours) == pytest.approx(metrics.aggregate_iqm(scores[0]))
+    expected = metrics.probability_of_improvement(scores[0], others)
+    assert improvement(ours, list(others.T)).value == pytest.approx(expected)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # of how it calls its own bootstrap
+        _, bounds = library.get_interval_estimates(
+            {"a": scores[0]},
+            lambda x: np.array([metrics.aggregate_iqm(x)]),
+            reps=2000,
+            random_state=np.random.RandomState(0),
+        )
+    _, low, high = stratified_bootstrap(ours, interquartile_mean)
+    assert (low, high) == pytest.approx(tuple(bounds["a"].ravel()), abs=0.03)
 
 
 @needs_zoo
@@ -267,6 +386,7 @@ def test_command_runs_resumes_and_reports(
     runs = store.read_runs(tmp_path).set_index("algo")
     assert runs.steps[["CRPN", "TRPO"]].eq(1200).all()
     assert runs.mean_return.between(9, 500).all()
+    assert runs.updates["TRPO"] == 1  # of 2 × 512 steps
     assert runs.entry["TRPO"] == "trpo.yml: CartPole-v1"
     assert set(store.read_curves(tmp_path).algo) == {"CRPN", "TRPO"}
 

@@ -7,12 +7,13 @@ import math
 import pytest
 import torch
 
+from benchmarks.common.parts import Parts
 from benchmarks.speed import memory, products, timing, training, updates
-from benchmarks.speed.__main__ import JSON, PARTS, main, run_part
+from benchmarks.speed.__main__ import PARTS, RESULTS, main, run_part
 from benchmarks.speed.problems import SHAPES, collect, noise, noise_model, width_for
 from benchmarks.speed.products import product_tasks
-from benchmarks.speed.tables import TITLES, interval, markdown, number, report
-from benchmarks.speed.timing import CLOCKS, Task, compare, interleaved, median, slope
+from benchmarks.speed.tables import TITLES, report
+from benchmarks.speed.timing import CLOCKS, Task, compare, interleaved, slope
 from sb3_crpn import CRPN
 
 TINY = {
@@ -20,21 +21,13 @@ TINY = {
     "updates": {"repeats": 1, "n_steps": 64},
     "collection": {"repeats": 1, "n_steps": 64},
     "stepping": {"repeats": 1, "n_steps": 5},
+    "many": {"repeats": 1, "n_steps": 128, "n_cases": 1},
     "training": {"repeats": 1, "timesteps": 1},
     "solves": {"repeats": 1, "dense": (5, 8), "krylov": (10, 20)},
     "scaling": {"repeats": 2, "timesteps": (20, 40), "parameters": (100, 200), "n_steps": 20},
     "memory": {"timesteps": (50, 100), "parameters": (100,), "updates": (60,)},
     "device": {"repeats": 1, "sizes": ((4, 40),), "episode": 10},
 }
-
-
-def test_the_interval_of_a_median_is_that_of_order_statistics():
-    assert median([0.0] * 10 + [5.0] * 10) == [2.5, 0.0, 5.0]
-    # P(Binomial(20, 1/2) <= 5) = 2.07 %, <= 6 is 5.8 %: the 6th and the 15th of 20
-    assert median(range(1, 21)) == [10.5, 6.0, 15.0]
-    # P(Binomial(6, 1/2) = 0) = 1.6 %
-    assert median([3, 1, 2, 6, 5, 4]) == [3.5, 1.0, 6.0]
-    assert median([2.0]) == [2.0, 2.0, 2.0]
 
 
 def test_the_slope_of_a_power_law_is_its_exponent():
@@ -107,7 +100,7 @@ def test_the_timed_gradient_is_that_of_the_update():
     model.actor.flatten = lambda tensors: flattened.append(flatten(tensors)) or flattened[-1]
     products.gradient_of(model, batch)()
     del model.actor.flatten
-    expected = model._estimate_from(batch, batch).gradient
+    expected = model._estimate_from(batch).gradient
     torch.testing.assert_close(flattened[-1] / 2, expected, rtol=1e-5, atol=1e-6)
     assert list(product_tasks(model, batch)) == list(memory.PRODUCTS)
 
@@ -127,17 +120,10 @@ def test_updates_are_compared_on_the_same_rollout_and_repeat_it():
         task.prepare()
         assert ours.n_critic_updates == 0
         task.run()
-        results.append((ours.actor.vector, ours._fitted_alpha, ours._n_updates))
+        results.append((ours.actor.vector, ours.kl_control.alpha, ours._n_updates))
     assert torch.equal(results[0][0], results[1][0])
     assert results[0][1:] == results[1][1:]
     assert ours._n_updates == updates.WARM_UP_ROLLOUTS + 1
-
-
-def test_tables():
-    assert number(1234.5) == "1234"
-    assert number(0.012345) == "0.0123"
-    assert interval([1.0, 0.5, 2.0]) == "1.00 [0.50, 2.00]"
-    assert markdown(["a", "b"], [[1, "x"]]) == "| a | b |\n| --- | --- |\n| 1 | x |"
 
 
 def test_every_part_has_a_title_and_a_tiny_size():
@@ -146,14 +132,15 @@ def test_every_part_has_a_title_and_a_tiny_size():
 
 @pytest.mark.parametrize("part", [part for part in PARTS if part not in ("training", "memory")])
 def test_parts_write_their_results_and_tables_come_from_the_file(part, tmp_path, capsys):
-    file = tmp_path / "speed.json"
-    file.write_text(json.dumps({"other": "kept", part: "replaced"}))
+    file = tmp_path / "speed.csv"
+    for earlier in ("other", part):
+        Parts(file).replace(earlier, [{"text": "earlier"}])
     run_part(part, file, **TINY[part])
     printed = capsys.readouterr().out.strip()
-    results = json.loads(file.read_text())
-    assert results["other"] == "kept"
+    results = Parts(file).read()
+    assert results.pop("other") == [{"text": "earlier"}]
     assert report(results) == printed
-    main(["--table", "--json", str(file)])
+    main(["--table", "--results", str(file)])
     assert capsys.readouterr().out.strip() == printed
     assert f"## {TITLES[part]}" in printed
     assert "Skipped" in printed or "| --- |" in printed
@@ -174,7 +161,7 @@ def test_memory_is_the_median_growth_over_processes(monkeypatch, tmp_path, capsy
         return {"task": task, **case, "d": 7, "before": 100.0, "peak": next(peaks)}
 
     monkeypatch.setattr(memory, "in_a_process", in_a_process)
-    run_part("memory", tmp_path / "speed.json", repeats=3, **TINY["memory"])
+    run_part("memory", tmp_path / "speed.csv", repeats=3, **TINY["memory"])
     assert "| 50 | 7 | whole | 30 | 30 | 30 |  |  |  |" in capsys.readouterr().out
 
 
@@ -194,6 +181,6 @@ def test_only_parts_that_there_are(capsys):
     assert "prodcuts is no part" in capsys.readouterr().err
 
 
-@pytest.mark.skipif(not JSON.exists(), reason="not measured yet")
 def test_the_committed_results_print():
-    assert report(json.loads(JSON.read_text()))
+    assert set(Parts(RESULTS).read()) == set(PARTS)
+    assert report(Parts(RESULTS).read())

@@ -22,5 +22,5 @@ def test_an_eigenvalue_that_rounding_made_negative_counts_as_zero():
 
 @pytest.mark.parametrize("damping", [0.0, -1.0, math.nan, math.inf])
 def test_damping_is_positive(damping):
-    with pytest.raises(ValueError, match=r"damping=.* must be a finite number > 0"):
+    with pytest.raises(ValueError, match=r"Fisher: damping=.* must be a finite number in"):
         Fisher(damping)

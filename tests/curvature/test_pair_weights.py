@@ -40,5 +40,5 @@ def test_pair_weights_take_several_vectors_at_once(case):
 
 @pytest.mark.parametrize("decay", [-0.1, 1.1, float("nan")])
 def test_decay_is_a_fraction(decay):
-    with pytest.raises(ValueError, match=r"decay=.* must be in \[0, 1\]"):
+    with pytest.raises(ValueError, match=r"Causal: decay=.* must be a finite number in \[0, 1\]"):
         Causal(decay)

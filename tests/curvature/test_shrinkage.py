@@ -58,7 +58,7 @@ def test_a_constant_looks_at_no_group():
 
 @pytest.mark.parametrize("value", [-0.1, 1.1, math.nan])
 def test_a_constant_is_a_fraction(value):
-    with pytest.raises(ValueError, match=r"value=.* must be in \[0, 1\]"):
+    with pytest.raises(ValueError, match=r"Constant: value=.* must be a finite number in \[0, 1\]"):
         Constant(value)
 
 

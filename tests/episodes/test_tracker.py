@@ -39,7 +39,7 @@ def test_quota_from_steps():
 
 def begun(n_episodes, at_episode_start, horizon=None):
     tracker = EpisodeTracker()
-    tracker.begin(RolloutSize(0, n_episodes, horizon), np.array(at_episode_start))
+    tracker.begin(RolloutSize(0, n_episodes, horizon), 1 - np.array(at_episode_start, int))
     return tracker
 
 
@@ -93,11 +93,11 @@ def test_an_environment_without_quota_is_ignored():
 class FirstToFinish(EpisodeTracker):
     """The mistake: the first m episodes to finish, whichever environment they come from."""
 
-    def begin(self, size, at_episode_start):
-        super().begin(size, at_episode_start)
+    def begin(self, size, times):
+        super().begin(size, times)
         self._missing = size.n_episodes
         self._remaining[:] = self._missing
-        self._recording = at_episode_start.copy()
+        self._recording = times == 0
 
     @property
     def complete(self):

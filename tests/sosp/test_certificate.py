@@ -233,7 +233,7 @@ def test_environments_of_other_spaces_are_refused():
 
 
 def test_an_endless_episode_is_an_error(monkeypatch):
-    monkeypatch.setattr("sb3_crpn.sosp.episodes.ENDLESS", 30)
+    monkeypatch.setattr("sb3_crpn.episodes.collector.ENDLESS", 30)
     endless = Sampler(spaces.Box(-1.0, 1.0, (2,)), spaces.Discrete(2), length=10**9)
     model = PPO("MlpPolicy", endless, device="cpu")
     with pytest.raises(ValueError, match="no episode ended within 30 steps"):

@@ -3,10 +3,11 @@ import pytest
 import torch
 from torch.func import jacrev
 
+from benchmarks.exact import TabularMDP
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.theory import Constants, ScoreBounds, softmax_linear
-from tests.mdp import TabularMDP, random_mdp, random_parameters, tabular_crpn
+from tests.mdp import random_mdp, random_parameters, tabular_crpn
 from tests.policies import estimator_of, small_policy
 
 NAMES = ["cost_bound", "M_g", "M_H", "L_H", "G_g", "G_H", "M_1", "M_2"]
@@ -22,7 +23,7 @@ def two_armed_bandit():
     """Reward 1 or -1 for the one action: J = -tanh(x/2), x the difference of the logits."""
     one = torch.ones(1, dtype=torch.float64)
     reward = torch.tensor([[1.0, -1.0]], dtype=torch.float64)
-    return TabularMDP(one, one.expand(1, 2, 1), reward, torch.zeros_like(reward), 1)
+    return TabularMDP(one, one.expand(1, 2, 1), reward, torch.tensor([0]), horizon=1, gamma=0.8)
 
 
 def gradient(mdp, theta):

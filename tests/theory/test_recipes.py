@@ -7,6 +7,7 @@ import pytest
 import torch
 from stable_baselines3.common.env_util import make_vec_env
 
+from benchmarks.exact import TabularEnv
 from sb3_crpn import ACRPN, PAPER, theory
 from sb3_crpn.cubic import solve_dense
 from sb3_crpn.theory import (
@@ -18,7 +19,7 @@ from sb3_crpn.theory import (
     high_probability_recipe,
     softmax_linear,
 )
-from tests.mdp import TabularEnv, random_mdp, tabular_crpn
+from tests.mdp import random_mdp, tabular_crpn
 
 BANDIT = Constants(K=1.0, scores=softmax_linear(1.0), H=1, d=8)
 RECIPES = {

@@ -1,11 +1,11 @@
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from benchmarks.exact import coordination_mdp, random_mdp
-from tests.mdp import TabularMDP as EnumeratedMDP
+from benchmarks.exact import coordination_mdp, expected_causal_hessian, random_mdp
 
 MDPS = [
     coordination_mdp(gamma=0.9, noise=0.5),
@@ -13,6 +13,7 @@ MDPS = [
     random_mdp(1, n_states=3, n_actions=3, horizon=3),
     random_mdp(2, n_states=4, n_observations=2, horizon=3),  # aliased
     random_mdp(3, n_states=4, n_observations=1, horizon=2, gamma=1.0),
+    random_mdp(4, n_states=3, horizon=3, max_stop=0.5),
 ]
 mdps = pytest.mark.parametrize("mdp", MDPS)
 
@@ -30,15 +31,17 @@ def policy(mdp, theta):
 
 
 def enumerated_cost(mdp, theta):
-    """-Σ_τ P(τ) Σ_h γ^h r_h over every sequence of states and actions."""
+    """-Σ_τ P(τ) Σ_h γ^h r_h P(not stopped before h | τ) over every sequence of H cells."""
+    stop = np.zeros(mdp.reward.shape) if mdp.stop is None else mdp.stop.numpy()
     initial, transition, reward = (x.numpy() for x in (mdp.initial, mdp.transition, mdp.reward))
     pi, seen, total = policy(mdp, theta), mdp.observation.numpy(), 0.0
     cells = list(itertools.product(range(len(initial)), range(mdp.n_actions)))
     for episode in itertools.product(cells, repeat=mdp.horizon):
-        probability, value, into = 1.0, 0.0, initial
+        probability, value, into, alive = 1.0, 0.0, initial, 1.0
         for h, (state, action) in enumerate(episode):
             probability *= into[state] * pi[seen[state], action]
-            value += mdp.gamma**h * reward[state, action]
+            value += mdp.gamma**h * alive * reward[state, action]
+            alive *= 1.0 - stop[state, action]
             into = transition[state, action]
         total -= probability * value
     return total
@@ -66,13 +69,23 @@ def test_the_derivatives_are_those_of_the_enumerated_cost(mdp):
     torch.testing.assert_close(mdp.hessian(theta), hessian, rtol=0, atol=1e-8)
 
 
-def test_it_agrees_with_the_mdp_of_the_package_tests():
-    mdp = random_mdp(5, horizon=6)
-    other = EnumeratedMDP(
-        mdp.initial, mdp.transition, mdp.reward, torch.zeros_like(mdp.reward), 6, mdp.gamma
-    )
+@mdps
+def test_the_surrogate_has_the_gradient_of_the_cost_and_no_curvature_across_time(mdp):
     theta = parameters(mdp)
-    torch.testing.assert_close(mdp.cost(theta), other.cost(theta), rtol=0, atol=1e-12)
+    gradient = central_differences(lambda at: mdp.surrogate(at, theta, mdp.gamma), theta)
+    torch.testing.assert_close(gradient, mdp.gradient(theta), rtol=0, atol=1e-9)
+    expected = expected_causal_hessian(mdp, theta, 0.0)
+    hessian = torch.autograd.functional.hessian(
+        lambda at: mdp.surrogate(at, theta, mdp.gamma), theta
+    )
+    torch.testing.assert_close(hessian, expected, rtol=0, atol=1e-12)
+
+
+def test_the_mean_length_of_episodes():
+    theta = parameters(MDPS[-1])
+    assert random_mdp(0, horizon=7).mean_length(parameters(random_mdp(0))) == pytest.approx(7)
+    mdp = replace(MDPS[-1], stop=torch.full((3, 2), 0.5, dtype=torch.float64))
+    assert mdp.mean_length(theta) == pytest.approx(1 + 0.5 + 0.25)
 
 
 @mdps
