@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_crpn import ACRPN, PAPER
-from sb3_crpn.algorithm.evaluation import CandidateEvaluator
+from sb3_crpn.algorithm.evaluation import CandidateEvaluator, StepEvaluation
 from sb3_crpn.episodes import collector
 from tests.envs import Drift, Faulty, FaultyReset, Rewards, Sampler
 from tests.training import TrainLog, all_finite, both, make, same, several, tensors
@@ -165,6 +165,21 @@ def test_interrupt_while_steps_are_tried(algorithm, trial, monkeypatch, tmp_path
         model.learn(20, reset_num_timesteps=False)
     monkeypatch.undo()
     goes_on(model, earlier, tmp_path / "model")
+
+
+@both
+def test_the_rollout_of_a_step_that_is_not_finite_is_not_reused(algorithm, monkeypatch):
+    """What spoilt one step would spoil the next ones."""
+    model, log, evaluate = make(algorithm, n_episodes=3), TrainLog(), CandidateEvaluator.evaluate
+
+    def first_fails(self, step):
+        evaluation = evaluate(self, step)
+        return evaluation if model._n_updates else StepEvaluation(INF, INF)
+
+    monkeypatch.setattr(CandidateEvaluator, "evaluate", first_fails)
+    model.learn(100, log)
+    assert log["n_reused_rollouts"][:3] == [0, 0, 1]
+    assert log["step_rejected"][:2] == [1, 0]
 
 
 def test_killed_worker(tmp_path):

@@ -28,7 +28,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 from torch import nn
 
 from sb3_crpn import ACRPN, CRPN
@@ -182,14 +182,6 @@ def test_vec_normalize(algorithm, tmp_path):
     model.save(tmp_path / "model")
     assert not same(make(algorithm, several()), tensors(model))
     assert same(algorithm.load(tmp_path / "model", env=env, device="cpu"), tensors(model))
-
-
-def test_subprocesses():
-    env = SubprocVecEnv([Drift] * 2, start_method="spawn")
-    try:
-        trains(make(ACRPN, env))
-    finally:
-        env.close()
 
 
 @both

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import solve_banded
 
 from sb3_crpn.arrays import FloatArray, IntArray
-from sb3_crpn.episodes.batch import episode_scan, episode_starts, episode_time, moments
+from sb3_crpn.episodes.batch import discount_factors, episode_scan, episode_starts, moments
 
 
 def generalized_advantages(
@@ -77,5 +77,5 @@ def cost_advantages(
         mean, variance = moments(advantages)
         advantages = (advantages - mean) / (math.sqrt(variance) + 1e-8)  # 1e-8: as in SB3's PPO
     if discount_visitation:
-        advantages = advantages * gamma ** episode_time(lengths, times)
+        advantages = advantages * discount_factors(gamma, lengths, times)
     return -advantages

@@ -38,6 +38,13 @@ def episode_time(lengths: IntArray, times: IntArray | int = 0) -> IntArray:
     return time
 
 
+@np.errstate(under="ignore")
+def discount_factors(gamma: float, lengths: IntArray, times: IntArray | int = 0) -> FloatArray:
+    """Return γ^i, i the time of each step in its trajectory, [T]; 0 where that underflows."""
+    factors: FloatArray = np.power(gamma, episode_time(lengths, times))
+    return factors
+
+
 def episode_chunks(lengths: IntArray, max_steps: int) -> list[slice]:
     """Cut episodes laid end to end into runs of at most ``max_steps`` steps, or of one episode."""
     ends = np.cumsum(lengths)
@@ -81,6 +88,7 @@ def moments(values: FloatArray) -> tuple[float, float]:
     return mean_and_variance(values)
 
 
+@np.errstate(under="ignore")  # powers of a factor: what underflows is 0
 def episode_scan(
     values: FloatArray, factor: float, lengths: IntArray, *, reverse: bool = False
 ) -> FloatArray:
@@ -114,7 +122,7 @@ def episode_scan(
     filtered: FloatArray = lfilter([1.0], [1.0, -factor], values, axis=0)
     inherited = np.zeros((len(lengths), *filtered.shape[1:]))
     inherited[1:] = filtered[episode_starts(lengths)[1:] - 1]
-    decay = factor ** (episode_time(lengths) + 1.0)
+    decay = discount_factors(factor, lengths, 1)
     columns = (-1, *[1] * (filtered.ndim - 1))
     own: FloatArray = filtered - decay.reshape(columns) * np.repeat(inherited, lengths, axis=0)
     return own

@@ -19,7 +19,7 @@ from sb3_crpn.episodes import (
     EpisodeTracker,
     RolloutSize,
 )
-from sb3_crpn.episodes.batch import episode_time
+from sb3_crpn.episodes.batch import discount_factors
 from sb3_crpn.policy import state_values
 
 
@@ -100,7 +100,7 @@ def with_baseline(policy: ActorCriticPolicy, batch: EpisodeBatch, gamma: float) 
     """
     with torch.no_grad():
         values = state_values(policy, batch.observations).cpu().double().numpy()
-    baseline = gamma ** episode_time(batch.lengths) * values
+    baseline = discount_factors(gamma, batch.lengths) * values
     return replace(batch, cost_advantages=batch.cost_advantages + baseline)
 
 

@@ -14,7 +14,7 @@ from torch.nn.functional import logsigmoid
 
 from sb3_crpn.arrays import Operator
 from sb3_crpn.curvature.derivatives import policy_distribution
-from sb3_crpn.episodes.batch import EpisodeBatch, episode_time
+from sb3_crpn.episodes.batch import EpisodeBatch, discount_factors
 from sb3_crpn.parameters import ActorParameters
 
 # Actions expected so many times in all the episodes, and no more, may be missing from them: a
@@ -49,7 +49,7 @@ def model_covariance(
     potential = (divergence.new_tensor(batch.cost_advantages**2) * divergence).sum()
     log_probs = _log_probabilities(current)
     if log_probs is not None:
-        costs = gamma ** episode_time(batch.lengths) * batch.returns
+        costs = discount_factors(gamma, batch.lengths) * batch.returns
         scale = log_probs.new_tensor(np.abs(costs) + np.abs(batch.cost_advantages + costs))
         weights = _rare_probabilities(log_probs.detach()) * scale[:, None] ** 2
         potential = potential + 0.5 * (weights * (log_probs - log_probs.detach()) ** 2).sum()

@@ -1,10 +1,14 @@
 from dataclasses import asdict, fields
 
+import numpy as np
 import pytest
+import scipy.linalg
+import torch
 from stable_baselines3.common.logger import Logger
 
-from sb3_crpn import ACRPN
+from sb3_crpn import ACRPN, CRPN
 from sb3_crpn.algorithm.statistics import UpdateStats
+from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from tests.training import TrainLog, both, make
 
 ALSO = {
@@ -71,3 +75,38 @@ def test_a_new_learn_forgets_the_last_update(algorithm, tmp_path):
     model.learn(1, lambda local, _: seen.append(local["self"].last_update) or True)
     assert seen[0] is None
     assert model.last_update.n_updates == model._n_updates
+
+
+def test_logged_values_are_those_of_the_rollout_and_its_matrices(monkeypatch):
+    """Explained variance, the leftmost eigenvalue of H relative to M = F + εI, and products."""
+    model, log = make(CRPN, net_arch=[], n_reused_rollouts=0, solver="dense"), TrainLog()
+    estimate, product = model._estimate, EpisodeDerivatives.fisher_product
+    seen, products = [], []
+
+    def recorded(*arguments):
+        found = estimate(*arguments)
+        seen.append((found.gradient_batch, found.hessian.to_dense(), found.fisher.to_dense()))
+        products.clear()
+        return found
+
+    def counted(self, vector):
+        products.append(vector)
+        return product(self, vector)
+
+    model._estimate = recorded
+    monkeypatch.setattr(EpisodeDerivatives, "fisher_product", counted)
+    model.learn(1, log)
+    [(batch, hessian, fisher)] = seen
+    unexplained = np.var(batch.returns - batch.values) / np.var(batch.returns)
+    assert log["explained_variance"] == pytest.approx([1.0 - unexplained])
+    metric = fisher + model.fisher_damping * torch.eye(len(fisher))
+    leftmost = scipy.linalg.eigh(hessian, metric, eigvals_only=True)[0]
+    assert log["lambda_min"] == pytest.approx([leftmost], rel=1e-4)
+    assert log["hessian_vector_products"] == [len(products) / 2]  # two folds
+
+
+@both
+def test_a_krylov_space_costs_as_many_products_as_it_has_dimensions(algorithm):
+    log, settings = TrainLog(), {"solver": "krylov"} if algorithm is CRPN else {}
+    make(algorithm, krylov_dim=7, **settings).learn(100, log)
+    assert log["hessian_vector_products"] == [7] * len(log.rows)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from sb3_crpn.episodes import EpisodeBatch, episode_scan
 from sb3_crpn.episodes.batch import (
     concatenate,
+    discount_factors,
     episode_starts,
     episode_time,
     round_robin_split,
@@ -46,6 +47,15 @@ def test_scan_of_a_long_batch_keeps_its_precision():
     values = np.ones(lengths.sum())
     expected = episode_time(lengths) + 1.0
     assert np.array_equal(episode_scan(values, 1.0, lengths), expected)
+
+
+def test_powers_that_underflow_are_zero_whatever_numpy_is_told():
+    lengths = np.array([2000, 3])
+    with np.errstate(all="raise"):
+        factors = discount_factors(0.5, lengths)
+        sums = episode_scan(np.ones(2003), 0.5, lengths)
+    assert factors[[0, 3, 1999, 2000, 2002]].tolist() == [1.0, 0.125, 0.0, 1.0, 0.25]
+    np.testing.assert_allclose(sums[[0, 1, 1999, 2000, 2002]], [1.0, 1.5, 2.0, 1.0, 1.75])
 
 
 def test_time_and_starts_of_episodes_laid_end_to_end():
