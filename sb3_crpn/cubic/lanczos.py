@@ -1,16 +1,24 @@
 """Orthonormal bases of Krylov spaces by Lanczos with full reorthogonalisation."""
 
+import warnings
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from sb3_crpn.arrays import ArrayLike, FloatArray, Operator, as_vector
-from sb3_crpn.checks import COUNT
-from sb3_crpn.cubic.step import EPS, CountedOperator
+from sb3_crpn.checks import COUNT, SEED, integer
+from sb3_crpn.cubic.step import EPS, CountedOperator, random_unit_vector
 
 # krylov_basis takes a space for invariant where the remainder is below this multiple of EPS·‖A‖:
 # repeated eigenvalues left 5 to 27 for d = 30 to 3000, once 150 for d = 10
 _BREAKDOWN = 200.0
+
+# leftmost_eigenvalues takes an eigenvalue for found where its residual is below this part of ‖A‖
+_TOLERANCE = 1e-8
+
+# max_products=None: min(d, 1000), as for solve_krylov
+_MAX_PRODUCTS = 1000
 
 
 class KrylovSpace:
@@ -117,3 +125,80 @@ def krylov_basis(matvec: Operator, start: ArrayLike, dim: int) -> tuple[Tensor, 
         images.append(image)
     basis = space.basis.T.contiguous()
     return basis, torch.stack(images, dim=1) if images else basis.clone()
+
+
+def leftmost_eigenvalues(
+    matvec: Operator,
+    like: ArrayLike,
+    k: int = 1,
+    *,
+    max_products: int | None = None,
+    seed: int = 0,
+) -> Tensor:
+    """Return the k leftmost eigenvalues of a symmetric A, ascending, from products alone.
+
+    Lanczos with full reorthogonalisation from a random start, until the Ritz pairs (θ, v) have
+    ‖Av - θv‖ ≤ 1e-8 ‖A‖: an eigenvalue lies as near to θ. Where the chain has spanned all that
+    its start can see, another start finds more, such as repeated eigenvalues; a repeated one may
+    be returned once where the chain goes on beyond it.
+
+    Parameters
+    ----------
+    matvec
+        v ↦ Av, float64 Tensor[d] to Tensor[d].
+    like
+        A vector of A's size and device, [d].
+    k
+        Eigenvalues wanted, 1 to d.
+    max_products
+        Most products spent, at least k; None: min(d, 1000). Memory: 8·d bytes a product. Where they
+        run out, a warning says so, and the last values are bounds from above.
+    seed
+        Of the random starts; the global generator is not touched.
+
+    Returns
+    -------
+    Tensor
+        float64 [k].
+
+    Raises
+    ------
+    ValueError
+        For a wrong shape, a non-finite number (products included), k out of range,
+        max_products < k.
+    """
+    name = "leftmost_eigenvalues"
+    vector = as_vector(f"{name}: like", like)
+    k = integer(1, vector.numel())(f"{name}: k", k)
+    limit = min(vector.numel(), _MAX_PRODUCTS) if max_products is None else max_products
+    limit = min(vector.numel(), integer(k)(f"{name}: max_products", limit))
+    seed = SEED(f"{name}: seed", seed)
+    space = KrylovSpace(CountedOperator(f"{name}: matvec", matvec), vector, _BREAKDOWN)
+    chain = space.open(random_unit_vector(vector, seed))
+    while True:
+        for _ in range(1 + space.size // 16):  # the projected problem is O(k³), see krylov.py
+            if space.size < limit and space.extend(chain) is None:
+                chain = space.open(random_unit_vector(vector, seed + len(space.chains)))
+        values, error = _ritz(space, k)
+        if len(values) == k and error <= _TOLERANCE * space.norm:
+            return values
+        if space.size == limit:
+            break
+    warnings.warn(
+        f"{name}: {limit} products are too few for {k} eigenvalues: the residual is {error:.1e}, "
+        f"wanted {_TOLERANCE * space.norm:.1e}; the values returned are bounds from above",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+    return values
+
+
+def _ritz(space: KrylovSpace, k: int) -> tuple[Tensor, float]:
+    """Return the leftmost Ritz values, at most k of them, and the largest of their residuals."""
+    values, vectors = np.linalg.eigh(space.projected)
+    residuals = torch.zeros(space.dim, min(k, len(values)), dtype=torch.float64)
+    for chain, end in zip(space.chains, space.ends, strict=True):
+        if end is not None and chain:
+            residuals += torch.outer(end.cpu(), torch.from_numpy(vectors[chain[-1], :k]))
+    error = float(torch.linalg.vector_norm(residuals, dim=0).max())
+    return torch.from_numpy(values[:k]), error

@@ -59,6 +59,15 @@ class CubicStep:
     lambda_min: float = math.nan
     at_sosp: bool = False
 
+    def __repr__(self) -> str:
+        """Return one line."""
+        norm = float(torch.linalg.vector_norm(self.step))
+        return (
+            f"CubicStep({self.status}: ‖s‖ = {norm:.3g}, λ = {self.multiplier:.3g}, "
+            f"decrease {self.predicted_decrease:.3g}, residual {self.residual:.1e}, "
+            f"{self.products} products, {'' if self.certified else 'not '}certified)"
+        )
+
 
 class CountedOperator:
     """A user's ``v ↦ Hv`` that counts its calls and answers in v's dtype, on v's device.

@@ -150,6 +150,14 @@ class CurvatureEstimate:
     gradient_noise: float
     gradient_batch: EpisodeBatch
 
+    def __repr__(self) -> str:
+        """Return one line."""
+        norm = float(torch.linalg.vector_norm(self.gradient))
+        return (
+            f"CurvatureEstimate(d = {len(self.gradient)}, ‖g‖ = {norm:.3g}, "
+            f"noise {self.gradient_noise:.0%} of ‖g‖²)"
+        )
+
 
 def estimate_curvature(
     policy: ActorCriticPolicy,

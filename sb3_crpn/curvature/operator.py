@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
-from sb3_crpn.cubic import krylov_basis
+from sb3_crpn.arrays import Array, FloatArray
+from sb3_crpn.checks import FLAG, integer
+from sb3_crpn.cubic import krylov_basis, leftmost_eigenvalues
+from sb3_crpn.progress import progress
+
+if TYPE_CHECKING:
+    from scipy.sparse.linalg import LinearOperator
 
 # VᵀBV of more columns is made from products, whose memory does not grow with columns × timesteps
 MAX_FORM_COLUMNS = 128
+
+# to_dense warns above this d, where the dense solver's range ends (DESIGN section 4)
+MAX_DENSE = 2000
 
 
 class GroupedOperator:
@@ -95,10 +107,93 @@ class GroupedOperator:
         mean: torch.Tensor = torch.tensordot(self.weights.to(groups.device), groups, dims=1)
         return mean
 
-    def to_dense(self) -> torch.Tensor:
-        """Return B, exactly symmetric, [d, d]: d products, for small d and for tests."""
-        matrix = self @ torch.eye(self.shape[0], dtype=torch.float64)
+    def to_dense(self, *, progress_bar: bool = False) -> torch.Tensor:
+        """Return B, exactly symmetric, float64 [d, d]: d products, for small d and for tests.
+
+        Parameters
+        ----------
+        progress_bar
+            Show the products done; needs tqdm and rich.
+
+        Warns
+        -----
+        UserWarning
+            Before more than 2,000 products.
+        """
+        d = self.shape[0]
+        show = FLAG("to_dense: progress_bar", progress_bar)
+        if d > MAX_DENSE:
+            warnings.warn(
+                f"to_dense takes {d} products and {8e-9 * d * d:.2g} GB: eigenvalues(k) finds the "
+                "leftmost eigenvalues, and aslinearoperator() serves SciPy's solvers, with fewer",
+                stacklevel=2,
+            )
+        columns = []
+        with progress("products", d, show=show) as tick:
+            for unit in torch.eye(d, dtype=torch.float64):
+                columns.append(self @ unit)
+                tick(1)
+        matrix = torch.stack(columns, dim=1)
         return 0.5 * (matrix + matrix.T)
+
+    def eigenvalues(
+        self,
+        k: int = 1,
+        *,
+        max_products: int | None = None,
+        seed: int = 0,
+        progress_bar: bool = False,
+    ) -> torch.Tensor:
+        """Return the k leftmost eigenvalues, ascending, float64 [k], from products alone.
+
+        Parameters
+        ----------
+        k
+            1 to d.
+        max_products, seed
+            As in :func:`sb3_crpn.cubic.leftmost_eigenvalues`.
+        progress_bar
+            Show the products done, whose number is not known before; needs tqdm and rich.
+        """
+        k = integer(1, self.shape[0])("eigenvalues: k", k)
+        show = FLAG("eigenvalues: progress_bar", progress_bar)
+        with progress("products", None, show=show) as tick:
+
+            def product(vector: torch.Tensor) -> torch.Tensor:
+                tick(1)
+                return self @ vector
+
+            like = torch.ones(self.shape[0], dtype=torch.float64)
+            return leftmost_eigenvalues(product, like, k, max_products=max_products, seed=seed)
+
+    def aslinearoperator(self) -> LinearOperator:
+        """Return B for SciPy: a ``scipy.sparse.linalg.LinearOperator`` of float64 arrays.
+
+        ``scipy.sparse.linalg.eigsh(hessian.aslinearoperator(), k)`` gives eigenvectors, too.
+        """
+        from scipy.sparse.linalg import LinearOperator  # here: the import takes time
+
+        def product(array: Array) -> FloatArray:
+            operand = torch.from_numpy(np.asarray(array, dtype=np.float64))
+            result: FloatArray = (self @ operand).cpu().numpy()
+            return result
+
+        def vector_product(array: Array) -> FloatArray:
+            return product(array.reshape(-1))
+
+        return LinearOperator(
+            self.shape,
+            matvec=vector_product,
+            rmatvec=vector_product,
+            matmat=product,
+            rmatmat=product,
+            dtype=np.dtype(np.float64),
+        )
+
+    def __repr__(self) -> str:
+        """Return one line."""
+        d, weights = self.shape[0], ", ".join(f"{w:.3g}" for w in self.weights)
+        return f"GroupedOperator({d} × {d}, group weights {weights})"
 
     def _sum(self, name: str, term: torch.Tensor) -> torch.Tensor:
         return require_finite(name, self._total(term))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from sb3_crpn.curvature import Causal
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from sb3_crpn.episodes import EpisodeBatch
 from sb3_crpn.parameters import ActorParameters
+from sb3_crpn.progress import Tick
 from sb3_crpn.sosp.model_covariance import model_covariance
 
 # The causal estimator at κ = 1: unbiased (DESIGN section 2)
@@ -95,6 +96,23 @@ class BatchMeans:
         implied = torch.stack([self.model_covariance_product(column) for column in identity], dim=1)
         return self.from_matrices(
             self.gradients, 0.5 * (hessians + hessians.transpose(1, 2)), implied
+        )
+
+    def with_ticks(self, tick: Tick) -> BatchMeans:
+        """Return the same sample, which tells of each product with the Hessian of its episodes."""
+
+        def ticking(operator: Operator) -> Operator:
+            def product(vector: Tensor) -> Tensor:
+                tick(1)
+                return operator(vector)
+
+            return product
+
+        even, odd = self.half_products
+        return replace(
+            self,
+            block_products=ticking(self.block_products),
+            half_products=(ticking(even), ticking(odd)),
         )
 
     @property

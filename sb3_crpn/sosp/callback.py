@@ -11,8 +11,9 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import sync_envs_normalization
 
 from sb3_crpn.checks import COUNT, FLAG, NONE, VERBOSE, integer
-from sb3_crpn.sosp.certificate import ENVIRONMENT, certify_sosp, checked_options
+from sb3_crpn.sosp.certificate import certify_sosp, checked_options
 from sb3_crpn.sosp.report import SospReport
+from sb3_crpn.sosp.target import ENVIRONMENT
 
 
 class SospCallback(BaseCallback):
@@ -30,7 +31,8 @@ class SospCallback(BaseCallback):
         Environment to simulate in, wrapped as the training environment is. The statistics of a
         ``VecNormalize`` are copied over, as ``EvalCallback`` does.
     n_episodes, epsilon, rho
-        As in :func:`certify_sosp`.
+        As in :func:`certify_sosp`. With ``None`` each certificate has thresholds of its own policy:
+        give both to compare certificates along training.
     stop_at_sosp
         End training at the first verdict "sosp".
     seed
@@ -58,7 +60,7 @@ class SospCallback(BaseCallback):
         eval_freq: int,
         eval_env: GymEnv,
         n_episodes: int,
-        epsilon: float,
+        epsilon: float | None = None,
         rho: float | None = None,
         *,
         stop_at_sosp: bool = False,

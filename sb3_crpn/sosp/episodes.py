@@ -11,6 +11,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_crpn.arrays import BoolArray
 from sb3_crpn.episodes import (
     Collector,
     DictEpisodeRolloutBuffer,
@@ -18,9 +19,25 @@ from sb3_crpn.episodes import (
     EpisodeRolloutBuffer,
     EpisodeTracker,
     RolloutSize,
+    Segment,
 )
 from sb3_crpn.episodes.batch import discount_factors
 from sb3_crpn.policy import state_values
+from sb3_crpn.progress import Tick
+
+
+class _TickingTracker(EpisodeTracker):
+    """Tells of each episode that it keeps."""
+
+    def __init__(self, tick: Tick) -> None:
+        super().__init__()
+        self._tick = tick
+
+    def advance(self, dones: BoolArray) -> Iterator[Segment]:
+        """Take note of one step of every environment and yield the episodes that it ended."""
+        for segment in super().advance(dones):
+            self._tick(1)
+            yield segment
 
 
 @contextmanager
@@ -57,6 +74,7 @@ def collect_episodes(
     *,
     gamma: float,
     horizon: int | None = None,
+    tick: Tick = lambda n: None,
 ) -> EpisodeBatch:
     """Simulate whole episodes of the stochastic policy, a fixed quota from each environment.
 
@@ -76,6 +94,8 @@ def collect_episodes(
         γ.
     horizon
         Steps after which an episode is cut; ``None``: never.
+    tick
+        Told of each episode that has ended.
 
     Raises
     ------
@@ -88,7 +108,8 @@ def collect_episodes(
     collector.reset()
     buffer = _new_buffer(policy, env.num_envs, gamma)
     size = RolloutSize(n_steps=0, n_episodes=n_episodes, horizon=horizon)
-    collector.collect(buffer, EpisodeTracker(), size)
+    tracker = _TickingTracker(tick)
+    collector.collect(buffer, tracker, size)
     return buffer.episode_batch(baseline=False, normalize_advantage=False, discount_visitation=True)
 
 

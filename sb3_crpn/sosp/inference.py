@@ -63,6 +63,10 @@ class Interval:
         """Return "estimate [lower, upper]"."""
         return f"{self.estimate:.3g} [{self.lower:.3g}, {self.upper:.3g}]"
 
+    def __repr__(self) -> str:
+        """Return one line."""
+        return f"Interval({self})"
+
 
 def bootstrap_intervals(
     sample: BatchMeans,

@@ -53,6 +53,26 @@ def model_covariance(
         scale = log_probs.new_tensor(np.abs(costs) + np.abs(batch.cost_advantages + costs))
         weights = _rare_probabilities(log_probs.detach()) * scale[:, None] ** 2
         potential = potential + 0.5 * (weights * (log_probs - log_probs.detach()) ** 2).sum()
+    product = _hessian(potential, actor)
+    return lambda vector: product(vector) * n_blocks / batch.n_episodes**2
+
+
+def episode_fisher(
+    policy: ActorCriticPolicy, actor: ActorParameters, batch: EpisodeBatch
+) -> Operator:
+    """Return v ↦ Fv, the Fisher matrix of an episode's distribution, F = (1/E) Σ_i F(s_i).
+
+    KL(p_θ ‖ p_θ+v) = ½ vᵀFv + O(‖v‖³) for the distribution p of whole episodes.
+    """
+    with torch.no_grad():
+        reference = policy_distribution(policy, batch)
+    divergence = kl_divergence(reference, policy_distribution(policy, batch))
+    product = _hessian(divergence.sum(), actor)
+    return lambda vector: product(vector) / batch.n_episodes
+
+
+def _hessian(potential: Tensor, actor: ActorParameters) -> Operator:
+    """Return v ↦ ∇²(potential) v, one backward pass a product."""
     slope = torch.autograd.grad(potential, actor.tensors, create_graph=True, materialize_grads=True)
 
     def product(vector: Tensor) -> Tensor:
@@ -60,7 +80,7 @@ def model_covariance(
         curvature = torch.autograd.grad(
             torch.stack(along).sum(), actor.tensors, retain_graph=True, materialize_grads=True
         )
-        return actor.flatten(curvature) * n_blocks / batch.n_episodes**2
+        return actor.flatten(curvature)
 
     return product
 

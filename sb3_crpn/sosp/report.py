@@ -11,6 +11,7 @@ from torch import Tensor
 
 from sb3_crpn.sosp.inference import Interval
 from sb3_crpn.sosp.spectrum import Spectrum
+from sb3_crpn.sosp.thresholds import episodes_to_decide
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,10 +33,14 @@ class SospReport:
         first too large and the second too small, as the intervals allow for.
     epsilon, rho
         ε and ρ of ‖∇J‖ ≤ ε, λ_min(∇²J) ≥ -√(ρε).
+    thresholds
+        Where ε and ρ come from, for people.
     confidence, interval
         1 - δ, and how the intervals were made.
     n_episodes, n_steps
         What the estimates rest on.
+    likely_gradient_norm
+        ‖∇J‖ estimated without the bias of noise.
     gradient
         Estimate of ∇J, [d], in the order of ``policy.parameters()`` that log π depends on.
     escape_direction
@@ -49,10 +54,12 @@ class SospReport:
     lambda_min: Interval
     epsilon: float
     rho: float
+    thresholds: str
     confidence: float
     interval: IntervalMethod
     n_episodes: int
     n_steps: int
+    likely_gradient_norm: float
     gradient: Tensor
     escape_direction: Tensor
     spectrum: Spectrum
@@ -68,7 +75,8 @@ class SospReport:
 
         "not stationary": ‖∇J‖ > ε. Else ‖∇J‖ ≤ ε, and "sosp": λ_min ≥ -√(ρε), or "saddle":
         λ_min < -√(ρε), be it a saddle or a maximum of the cost. "undecided" where a threshold lies
-        inside its interval. A wrong verdict has probability 1 - ``confidence`` at most.
+        inside its interval. A wrong verdict has probability 1 - ``confidence`` at most, whatever
+        chose ε and ρ: the intervals do not depend on them.
         """
         if self.gradient_norm.lower > self.epsilon:
             return "not stationary"
@@ -79,19 +87,49 @@ class SospReport:
                 return "saddle"
         return "undecided"
 
+    @property
+    def episodes_to_decide(self) -> int | None:
+        """About how many episodes would decide, as intervals shrink with the root of their number.
+
+        ``None`` where the verdict is not "undecided", or where the intervals tell no number: one is
+        unlimited, or what is likely lies on a threshold.
+        """
+        if self.verdict != "undecided":
+            return None
+        return episodes_to_decide(
+            self.gradient_norm,
+            self.lambda_min,
+            self.likely_gradient_norm,
+            self.epsilon,
+            self.curvature_threshold,
+            self.n_episodes,
+        )
+
     def __str__(self) -> str:
         """Return a few lines for people."""
         leftmost = ", ".join(f"{value:.3g}" for value in self.spectrum.leftmost)
-        return "\n".join(
-            [
-                f"{self.verdict}: ε = {self.epsilon:g}, ρ = {self.rho:g}, "
-                f"{self.confidence:.0%} confidence ({self.interval})",
-                f"  ‖∇J‖        {self.gradient_norm}, stationary: ≤ {self.epsilon:.3g}",
-                f"  λ_min(∇²J)  {self.lambda_min}, "
-                f"no escape: ≥ -√(ρε) = {self.curvature_threshold:.3g}",
-                f"  leftmost    {leftmost}",
-                f"  {self.n_episodes} episodes, {self.n_steps} steps, d = {len(self.gradient)}",
-            ]
+        lines = [
+            f"{self.verdict}: ε = {self.epsilon:.3g}, ρ = {self.rho:.3g}, "
+            f"{self.confidence:.0%} confidence ({self.interval})",
+            f"  ‖∇J‖        {self.gradient_norm}, stationary: ≤ {self.epsilon:.3g}",
+            f"  λ_min(∇²J)  {self.lambda_min}, "
+            f"no escape: ≥ -√(ρε) = {self.curvature_threshold:.3g}",
+            f"  thresholds  {self.thresholds}",
+            f"  leftmost    {leftmost}",
+            f"  {self.n_episodes} episodes, {self.n_steps} steps, d = {len(self.gradient)}",
+        ]
+        if self.verdict == "undecided":
+            needed = self.episodes_to_decide
+            number = "an unknown number of" if needed is None else f"about {needed:,}"
+            lines.append(f"  {number} episodes would decide")
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        """Return one line."""
+        return (
+            f"SospReport({self.verdict}: ‖∇J‖ = {self.gradient_norm}, λ_min = {self.lambda_min}, "
+            f"ε = {self.epsilon:.3g}, -√(ρε) = {self.curvature_threshold:.3g}, "
+            f"{self.n_episodes} episodes)"
         )
 
     def plot(self) -> Figure:
@@ -126,22 +164,31 @@ def _draw_interval(
 
 
 def _draw_density(axes: Axes, spectrum: Spectrum, threshold: float) -> None:
-    low, high = min(spectrum.values[0], threshold), max(spectrum.values[-1], threshold)
+    """Draw the density, and the Ritz values as stems, each as high as its own part of it."""
+    low, high = spectrum.values[0], spectrum.values[-1]
+    if low - threshold <= max(high - low, 1e-12):  # one farther off would hide the spectrum
+        low, high = min(low, threshold), max(high, threshold)
+    else:
+        axes.text(0.02, 0.9, "← -√(ρε)", color="C3", fontsize=8, transform=axes.transAxes)
     margin = 0.05 * max(high - low, 1e-12)
+    width = 0.2 * margin
     points = np.linspace(low - margin, high + margin, 1000)
-    density = spectrum.density(points, width=0.2 * margin)
-    axes.semilogy(points, density, color="C0", lw=1)
+    density = spectrum.density(points, width=width)
+    heights = spectrum.weights / (width * math.sqrt(2.0 * math.pi))
+    top = max(density.max(), heights.max())
+    # far below 1/d of a network's eigenvalues; no stem ends below
+    bottom = 1e-7 * top
+    leftmost = np.isin(spectrum.values, spectrum.leftmost)
+    axes.semilogy(points, np.maximum(density, bottom), color="C0", lw=1)
+    for chosen, colour, label in ((~leftmost, "C0", "Ritz values"), (leftmost, "C1", "leftmost")):
+        values, ends = spectrum.values[chosen], np.maximum(heights[chosen], 3.0 * bottom)
+        axes.vlines(values, bottom, ends, color=colour, lw=1)
+        axes.plot(values, ends, "o", color=colour, ms=3, label=label)
     axes.axvline(threshold, color="C3", ls="--", lw=1)
-    axes.plot(
-        spectrum.leftmost,
-        [0.04] * len(spectrum.leftmost),
-        "|",
-        color="C1",
-        ms=12,
-        transform=axes.get_xaxis_transform(),
-        label="leftmost",
-    )
-    axes.set_ylim(bottom=1e-7 * density.max())  # far below 1/d of a network's eigenvalues
+    axes.locator_params(axis="x", nbins=6)
+    axes.set_xlim(points[0], points[-1])
+    axes.set_ylim(bottom, 3.0 * top)
     axes.legend(fontsize=8)
-    axes.set_title("spectral density", fontsize=10)
-    axes.set_xlabel("eigenvalue of ∇²J")
+    axes.set_title("spectral density of ∇²J", fontsize=10)
+    axes.set_xlabel("eigenvalue")
+    axes.set_ylabel("share of eigenvalues per unit")

@@ -49,6 +49,14 @@ class Spectrum:
     vector: Tensor
     residual: float
 
+    def __repr__(self) -> str:
+        """Return one line."""
+        return (
+            f"Spectrum({len(self.values)} Ritz values in "
+            f"[{self.values[0]:.3g}, {self.values[-1]:.3g}], d = {len(self.vector)}, "
+            f"leftmost to {self.residual:.1e})"
+        )
+
     def density(self, points: FloatArray, width: float) -> FloatArray:
         """Return Σ_i τ_i N(x; θ_i, width²), the smoothed spectral density at the points x."""
         deviations = (points[:, None] - self.values) / width

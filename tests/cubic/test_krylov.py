@@ -285,3 +285,12 @@ def test_a_solver_without_random_start_misses_the_hidden_direction(monkeypatch):
     assert_global_minimiser(problem, solve(problem))
     break_random_start(monkeypatch)
     assert is_rejected(problem, solve(problem))
+
+
+def test_a_step_is_one_line():
+    step = solve_krylov(torch.ones(2).double(), lambda v: v, 1.0)
+    assert str(step) == (
+        f"CubicStep(global minimiser: ‖s‖ = {step.step.norm():.3g}, λ = {step.multiplier:.3g}, "
+        f"decrease {step.predicted_decrease:.3g}, residual {step.residual:.1e}, "
+        f"{step.products} products, certified)"
+    )

@@ -1,5 +1,7 @@
+import numpy as np
 import pytest
 import torch
+from scipy.sparse.linalg import eigsh
 
 from sb3_crpn.curvature import Causal, GroupedOperator, estimate_curvature
 from tests.policies import frozen_episodes, small_policy
@@ -86,3 +88,77 @@ def test_products_that_are_not_finite_are_refused():
     ):
         with pytest.raises(ValueError, match=r"is not finite.* raise alpha, or set target_kl"):
             ask()
+
+
+def estimated(lengths=(3, 1, 4, 2, 5)):
+    policy, actor = small_policy("discrete")
+    return estimate_curvature(policy, actor, frozen_episodes(policy, lengths), Causal(0.5))
+
+
+def operator_of(matrix):
+    return GroupedOperator(len(matrix), lambda v: (matrix @ v)[None], torch.ones(1).double())
+
+
+def test_scipy_takes_it_as_a_linear_operator():
+    hessian = estimated().hessian
+    dense, linear = hessian.to_dense(), hessian.aslinearoperator()
+    assert linear.shape == hessian.shape
+    assert linear.dtype == np.float64
+    V = torch.randn(
+        hessian.shape[0], 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    )
+    np.testing.assert_allclose(linear @ V.numpy(), dense @ V, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(linear.T @ V[:, 0].numpy(), dense @ V[:, 0], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        linear @ V[:, :1].float().numpy(), dense @ V[:, :1], rtol=1e-5, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        np.sort(eigsh(linear, 3, which="SA", v0=np.ones(len(dense)))[0]),
+        torch.linalg.eigvalsh(dense)[:3],
+        rtol=1e-8,
+        atol=1e-10,
+    )
+
+
+@pytest.mark.parametrize("k", [1, 4, "d"])
+def test_eigenvalues_are_the_leftmost_of_the_matrix(k):
+    hessian = estimated().hessian
+    k = hessian.shape[0] if k == "d" else k
+    expected = torch.linalg.eigvalsh(hessian.to_dense())[:k]
+    torch.testing.assert_close(hessian.eigenvalues(k), expected, rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.parametrize("k", [0, 5, 1.0, None])
+def test_the_number_of_eigenvalues_is_at_most_the_dimension(k):
+    with pytest.raises(ValueError, match=f"^eigenvalues: k={k} .* an integer in \\[1, 4\\]"):
+        operator_of(torch.eye(4).double()).eigenvalues(k)
+
+
+def test_a_matrix_of_thousands_of_products_comes_with_a_warning(monkeypatch):
+    monkeypatch.setattr("sb3_crpn.curvature.operator.MAX_DENSE", 3)
+    operator_of(torch.eye(3).double()).to_dense()
+    with pytest.warns(UserWarning, match=r"to_dense takes 4 products.*eigenvalues\(k\)") as warned:
+        matrix = operator_of(torch.eye(4).double()).to_dense()
+    assert warned[0].filename == __file__
+    assert torch.equal(matrix, torch.eye(4).double())
+
+
+@pytest.mark.parametrize("name", ["to_dense", "eigenvalues"])
+def test_progress_is_shown_on_demand(name, capsys):
+    hessian = operator_of(torch.eye(4).double())
+    plain = getattr(hessian, name)()
+    assert "products" not in "".join(capsys.readouterr())
+    assert torch.equal(getattr(hessian, name)(progress_bar=True), plain)
+    assert "products" in "".join(capsys.readouterr())
+    with pytest.raises(ValueError, match=f"^{name}: progress_bar=1 "):
+        getattr(hessian, name)(progress_bar=1)
+
+
+def test_estimates_are_one_line():
+    estimate = estimated()
+    d = len(estimate.gradient)
+    assert repr(estimate.hessian) == f"GroupedOperator({d} × {d}, group weights 0.6, 0.4)"
+    norm, noise = estimate.gradient.norm(), estimate.gradient_noise
+    assert str(estimate) == (
+        f"CurvatureEstimate(d = {d}, ‖g‖ = {norm:.3g}, noise {noise:.0%} of ‖g‖²)"
+    )

@@ -1,9 +1,13 @@
+import sys
+from dataclasses import replace
+
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
 from sb3_contrib import TRPO
+from scipy.stats import binom
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -16,6 +20,8 @@ from tests.envs import Sampler
 
 SADDLE = torch.zeros(6, dtype=torch.float64)
 LAMBDA_MIN = -1.5  # at the saddle of the coordination MDP
+# λ_max of the Fisher matrix of its two steps, features (1, 0, 1) and (0, 1, 1), π = ½: ½ · 3
+FISHER = 1.5
 
 
 def tabular(mdp, theta, algorithm=PPO, **arguments):
@@ -120,12 +126,105 @@ def test_the_bernstein_intervals_hold_with_the_bounds_of_the_theory():
     assert report.verdict == "undecided"  # 50 episodes are few for a bound without assumptions
 
 
-def test_rho_is_the_papers_alpha_or_one():
+def test_rho_is_the_papers_alpha_or_matches_epsilon():
     paper = saddle(CRPN, alpha=7.0, n_episodes=4, **PAPER)
     assert certify_sosp(paper, 4, 0.1).rho == 7.0
-    assert certify_sosp(saddle(CRPN), 4, 0.1).rho == 1.0
-    assert certify_sosp(saddle(), 4, 0.1).rho == 1.0
     assert certify_sosp(paper, 4, 0.1, rho=2.0).rho == 2.0
+    for model in (saddle(CRPN), saddle()):
+        assert certify_sosp(model, 4, 0.1).rho == pytest.approx(4 * 0.1 * FISHER)
+
+
+class Scaled(gym.RewardWrapper):
+    def reward(self, reward):
+        return 100.0 * reward
+
+
+def test_default_thresholds_have_the_units_of_the_task():
+    reports = []
+    for wrap in (lambda env: env, Scaled):
+        env = DummyVecEnv([lambda wrap=wrap: wrap(TabularEnv(coordination_mdp()))])
+        env.seed(0)
+        reports.append(certify_sosp(saddle(), 40, env=env, seed=0))
+    plain, scaled = reports
+    assert plain.epsilon == pytest.approx(0.1 * FISHER**0.5)  # every return is 1 or -1
+    assert plain.curvature_threshold == pytest.approx(-0.2 * FISHER)
+    assert "ε = 0.1 G/s, ρ = 4ε/s²" in str(plain)
+    for name in ("epsilon", "rho", "curvature_threshold"):
+        assert getattr(scaled, name) == pytest.approx(100.0 * getattr(plain, name))
+
+
+def test_the_intervals_depend_on_no_threshold():
+    def intervals(*thresholds):
+        model = saddle()
+        model.get_env().seed(0)
+        report = certify_sosp(model, 20, *thresholds, seed=3)
+        return report.gradient_norm, report.lambda_min
+
+    assert intervals() == intervals(0.5) == intervals(0.01, 30.0)
+
+
+def thresholds_of_an_adversary(report):
+    """Those that the intervals just decide, every verdict in turn: chosen from the same data."""
+    of_gradient, of_curvature = report.gradient_norm, report.lambda_min
+    for epsilon in (0.999 * of_gradient.lower, of_gradient.upper, 2.0 * of_gradient.upper):
+        for curvature in (of_curvature.lower, 0.999 * of_curvature.upper, -1e-3):
+            if epsilon > 0.0 and curvature < 0.0:
+                yield epsilon, curvature**2 / epsilon
+
+
+def test_thresholds_chosen_from_the_same_episodes_keep_the_confidence():
+    """Default and adversary's: wrong with probability 1 - confidence at most."""
+    mdp, n, confidence = coordination_mdp(), 60, 0.8
+    theta = SADDLE + torch.tensor([0.3, -0.3, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    norm, lowest = mdp.gradient(theta).norm(), torch.linalg.eigvalsh(mdp.hessian(theta))[0]
+    model, wrong, decided = tabular(mdp, theta), 0, set()
+    model.get_env().seed(0)
+    for seed in range(n):
+        report = certify_sosp(model, 20, confidence=confidence, seed=seed)
+        asked = [(report.epsilon, report.rho), *thresholds_of_an_adversary(report)]
+        verdicts = [replace(report, epsilon=e, rho=r) for e, r in asked]
+        decided |= {each.verdict for each in verdicts}
+        wrong += any(
+            each.verdict not in ("undecided", truth(norm, lowest, each)) for each in verdicts
+        )
+    assert decided >= {"sosp", "saddle", "not stationary"}
+    assert wrong <= binom.ppf(1 - 1e-6, n, 1 - confidence)
+
+
+def truth(norm, lowest, report):
+    if norm > report.epsilon:
+        return "not stationary"
+    return "sosp" if lowest >= report.curvature_threshold else "saddle"
+
+
+def test_undecided_says_how_many_episodes_would_decide():
+    few = certify_sosp(saddle(), 40, epsilon=0.3, rho=1.0, seed=0)
+    assert few.verdict == "undecided"
+    needed = few.episodes_to_decide
+    assert f"about {needed:,} episodes would decide" in str(few)
+    many = certify_sosp(saddle(), 2 * needed, epsilon=0.3, rho=1.0, seed=0)
+    assert 40 < needed < 4000
+    assert many.verdict == "saddle"
+    assert many.episodes_to_decide is None
+    assert "would decide" not in str(many)
+
+
+def test_progress_is_shown_on_demand(capsys):
+    plain = certify_sosp(saddle(), 4, 0.5, seed=0)
+    assert "episodes" not in "".join(capsys.readouterr())
+    shown = certify_sosp(saddle(), 4, 0.5, seed=0, progress_bar=True)
+    assert shown.spectrum.leftmost.shape == plain.spectrum.leftmost.shape
+    text = "".join(capsys.readouterr())
+    assert "4/4" in text
+    assert "Hessian products" in text
+
+
+def test_a_missing_progress_bar_is_told_before_anything_is_simulated(monkeypatch):
+    monkeypatch.setitem(sys.modules, "tqdm.rich", None)
+    model = saddle()
+    with pytest.raises(ImportError, match="tqdm and rich"):
+        certify_sosp(model, 4, 0.5, progress_bar=True)
+    assert model._last_obs is None
 
 
 @pytest.mark.parametrize(
@@ -144,8 +243,10 @@ def test_every_space(actions, is_dict):
     observations = spaces.Dict({"x": box, "n": spaces.Discrete(3)}) if is_dict else box
     policy = "MultiInputPolicy" if is_dict else "MlpPolicy"
     model = PPO(policy, Sampler(observations, actions), device="cpu", n_steps=8, batch_size=8)
-    report = certify_sosp(model, 6, epsilon=1.0, seed=0)
+    report = certify_sosp(model, 6, seed=0)
     assert np.isfinite(report.lambda_min.estimate)
+    assert 0.0 < report.epsilon < np.inf
+    assert 0.0 < report.rho < np.inf
     assert len(report.spectrum.leftmost) == 5
 
 
@@ -248,6 +349,23 @@ def test_the_report_reads_and_draws():
     assert text.startswith("saddle: ε = 0.5")
     assert "95% confidence (bootstrap)" in text
     assert f"{report.lambda_min.estimate:.3g}" in text
+    assert "thresholds  ε given, ρ given" in text
+    assert "\n" not in repr(report)
+    assert repr(report).startswith("SospReport(saddle: ‖∇J‖ = ")
+    assert repr(report.lambda_min) == f"Interval({report.lambda_min})"
     figure = report.plot()
     assert len(figure.axes) == 3
     figure.canvas.draw()
+
+
+@pytest.mark.parametrize("rho", [1.0, 1e6], ids=["near", "far"])
+def test_the_density_shows_every_ritz_value_within_limits(rho):
+    report = certify_sosp(saddle(), 8, epsilon=0.5, rho=rho, seed=0)
+    axes = report.plot().axes[2]
+    assert axes.get_ylabel()
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    values = report.spectrum.values
+    assert left < values[0] < values[-1] < right < left + 3.0 * (values[-1] - values[0]) + 2.0
+    ends = np.concatenate([line.get_xydata() for line in axes.lines if line.get_marker() == "o"])
+    assert sorted(ends[:, 0]) == pytest.approx(sorted(values))
+    assert np.all((bottom < ends[:, 1]) & (ends[:, 1] < top))
