@@ -19,7 +19,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from unittest import mock
 
 import torch
@@ -193,46 +193,67 @@ def _quartiles(one: list[float], many: list[float]) -> Estimate:
     return Estimate(middle, low, high)
 
 
+class Ring(NamedTuple):
+    """What messages cost that go round a ring of processes.
+
+    A reduction by a ring of W ranks takes 2(W - 1) hops, each with 1/W of the bytes. Each message
+    costs the same besides, whatever W: packing it, waking up, a minibatch too small to be
+    efficient.
+
+    Attributes
+    ----------
+    per_hop, per_byte, per_message
+        Seconds.
+    """
+
+    per_hop: float
+    per_byte: float
+    per_message: float = 0.0
+
+    def seconds(self, number: float, total_bytes: float, n_ranks: int) -> float:
+        """Return what so many messages cost."""
+        hops = 2 * (n_ranks - 1)
+        reducing = number * hops * self.per_hop + total_bytes * hops / n_ranks * self.per_byte
+        return number * self.per_message + reducing
+
+
+def fit_ring(reductions: list[Row], n_ranks: int) -> Ring:
+    """Return the costs of a hop and a byte, from the smallest and the largest reduction."""
+    fastest = {row["bytes"]: row["seconds"] for row in reductions}
+    small, large = min(fastest), max(fastest)
+    hops = 2 * (n_ranks - 1)
+    per_byte = (fastest[large] - fastest[small]) / (large - small) * n_ranks / hops
+    return Ring(fastest[small] / hops, per_byte)
+
+
 def model_tables(
     results: dict[str, list[Row]], n_critic: int, critic: int, n_others: int, others: int
 ) -> Iterator[str]:
     """Yield what more ranks would do, each with the timesteps that one process had.
 
-    A reduction by a ring of W ranks takes 2(W - 1) hops, each with 1/W of the bytes. What the
-    measured ranks' update took beyond that and its share of the work is laid on the messages, each
-    the same, whatever W: packing them, waking up, and minibatches too small to be efficient. Work
-    and messages are taken at their fastest, when other processes disturbed them least.
+    What the measured ranks' update took beyond its share of the work and its reductions is laid on
+    the messages. Work and messages are taken at their fastest, when other processes disturbed them
+    least.
     """
     (case,) = results["circumstances"]
-    fastest = {row["bytes"]: row["seconds"] for row in results["reductions"]}
-    small, large = min(fastest), max(fastest)
-    hops = 2 * (case["ranks"] - 1)
-    per_hop = fastest[small] / hops
-    per_byte = (fastest[large] - fastest[small]) / (large - small) * case["ranks"] / hops
-
-    def reducing(number: float, total_bytes: float, n_ranks: int) -> float:
-        hops = 2 * (n_ranks - 1)
-        return number * hops * per_hop + total_bytes * hops / n_ranks * per_byte
-
+    ring = fit_ring(results["reductions"], case["ranks"])
     one, many = (
         {row["part"]: min(row["wall"]) for row in results["times"] if row["mode"] == mode}
         for mode in MODES
     )
     number, total = n_others + n_critic, others + n_critic * critic
-    explained = one["update"] / case["ranks"] + reducing(number, total, case["ranks"])
-    per_message = max(0.0, many["update"] - explained) / number
+    explained = one["update"] / case["ranks"] + ring.seconds(number, total, case["ranks"])
+    ring = ring._replace(per_message=max(0.0, many["update"] - explained) / number)
     work = one["collection"] + one["update"]
     yield (
-        f"{1e6 * per_message:.0f} µs a message and {1e6 * per_hop:.0f} µs a hop, "
-        f"{1e-9 / per_byte:.1f} GB/s, {work:.2f} s of work an update"
+        f"{1e6 * ring.per_message:.0f} µs a message and {1e6 * ring.per_hop:.0f} µs a hop, "
+        f"{1e-9 / ring.per_byte:.1f} GB/s, {work:.2f} s of work an update"
     )
     body = []
     for own in (case["batch size"], case["timesteps"]):  # a rank's part of a minibatch
         minibatches = n_critic * case["batch size"] / own
         for n_ranks in RANKS:
-            number = n_others + minibatches
-            waiting = number * per_message
-            waiting += reducing(number, others + minibatches * critic, n_ranks)
+            waiting = ring.seconds(n_others + minibatches, others + minibatches * critic, n_ranks)
             rate = n_ranks / (work + waiting)
             body.append([n_ranks, f"{n_ranks} · {own}", f"{waiting:.2f}",
                          f"{100 * work / (work + waiting):.0f} %",

@@ -8,7 +8,7 @@ import threading
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import active_children, get_context, parent_process
 from typing import TypeVar
@@ -53,15 +53,7 @@ def run_all(
         futures = {pool.submit(work, job): job for job in jobs}
         try:
             for future in as_completed(futures):
-                try:
-                    result = future.result()
-                except BrokenProcessPool:
-                    raise
-                except Exception:
-                    n_failed += 1
-                    tqdm.write(f"failed: {futures[future]}\n{traceback.format_exc()}")
-                else:
-                    keep(futures[future], result)
+                n_failed += not _handle(futures[future], future, keep)
                 bar.update()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
@@ -69,6 +61,19 @@ def run_all(
                 process.terminate()
             raise
     return n_failed
+
+
+def _handle(job: Job, future: Future[Result], keep: Callable[[Job, Result], None]) -> bool:
+    """Keep a job's result, or print why there is none; return whether there was one."""
+    try:
+        result = future.result()
+    except BrokenProcessPool:
+        raise
+    except Exception:
+        tqdm.write(f"failed: {job}\n{traceback.format_exc()}")
+        return False
+    keep(job, result)
+    return True
 
 
 def _start_worker() -> None:

@@ -146,7 +146,7 @@ Hessian (Walker2d-v5), CRPN is the arm without it.
 
 Seeds are those that all arms have. Some settings of the entries were tried on seeds 0 to 3 over a
 part of the budget ([which](benchmarks.md)), the others on seeds from 10 on; all were chosen for
-CRPN as it is.
+CRPN as it is. {progress}
 
 ## Aggregate
 
@@ -165,7 +165,11 @@ CRPN as it is.
 def report(comparison: Comparison) -> str:
     """Return the report's text."""
     means = {"IQM": interquartile_mean, "mean": mean_score}
+    learners = comparison.runs[comparison.runs.algo != RANDOM]
+    n_wanted = len(ARMS) * len(list(_cases()))
     return REPORT.format(
+        progress=f"{len(learners)} of {n_wanted} runs are there; one seed alone has no interval, "
+        "and says little.",
         aggregate=aggregate_table(comparison, comparison.learners, means),
         tasks=task_table(comparison),
         updates=updates_table(comparison),

@@ -180,6 +180,7 @@ def test_the_report_at_equal_settings_has_the_seeds_that_all_arms_have(tmp_path:
     np.testing.assert_array_equal(found.values(arms[1], walker, "mean_return"), [60, 61])
     text = equal.report(found)
     assert "| CRPN | 1.20 [" in text  # 60.5 / 50.5
+    assert "16 of 420 runs are there" in text
     assert f"| {task} | 33,333 | 33,333 | 33,333 | 33,333 |" in text
 
 
