@@ -97,7 +97,8 @@ class Collector:
     @property
     def at_episode_start(self) -> BoolArray:
         """Whether each environment stands at the start of a trajectory, [n_envs]."""
-        return self.times == 0
+        at_start: BoolArray = self.times == 0
+        return at_start
 
     def stand(self, observations: Any, times: IntArray) -> None:
         """Say where the environments stand; ``None``: reset them."""

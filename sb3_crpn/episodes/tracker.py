@@ -123,7 +123,7 @@ class EpisodeTracker:
             self._n_ended = np.zeros(n_envs, dtype=np.int64)
         self._remaining = episodes_per_env(size.n_episodes, n_envs)
         self._horizon = np.inf if size.horizon is None else size.horizon
-        self._recording = (times == 0) & (self._remaining > 0)
+        self._recording: BoolArray = (times == 0) & (self._remaining > 0)
         self._length = np.zeros(n_envs, dtype=np.int64)
         self._step = 0
 
