@@ -20,15 +20,18 @@ venv: $(DEV)
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
-	@# 25.1 brought --group
-	$(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
 
-$(RUN): pyproject.toml constraints.txt | $(BIN)/python
+# 25.1 brought --group
+$(VENV)/.pip: | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
+	@touch $@
+
+$(RUN): pyproject.toml constraints.txt | $(VENV)/.pip
 	@echo "Installing sb3-crpn, PyTorch, Matplotlib and the progress bar into $(VENV) (once) ..."
 	$(PIP) --editable ".[extra]"
 	@touch $@
 
-$(DEV): pyproject.toml constraints.txt | $(BIN)/python
+$(DEV): pyproject.toml constraints.txt | $(VENV)/.pip
 	@echo "Installing sb3-crpn with all extras and the development tools into $(VENV) (once) ..."
 	$(PIP) --editable ".[$(EXTRAS)]" --group dev
 	@touch $@ $(RUN)

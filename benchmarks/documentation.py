@@ -1,4 +1,4 @@
-"""The tables of README.md and docs/, from the committed measurements.
+"""The tables of README.md and docs/, and the README's picture, from the committed measurements.
 
     python -m benchmarks.documentation          # rewrite the tables in place
     python -m benchmarks.documentation --check  # fail where a page differs
@@ -15,21 +15,24 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 
-import pandas as pd
+from matplotlib.figure import Figure
 
-from benchmarks.learning import comparison, store, tables
+from benchmarks import distributed
+from benchmarks.common.markdown import estimate, markdown
+from benchmarks.learning import comparison, equal, store, tables
 from benchmarks.learning.comparison import Comparison
-from benchmarks.learning.settings import BUDGETS
+from benchmarks.learning.settings import TRPO_EQUAL
 from benchmarks.learning.statistics import interquartile_mean, stratified_bootstrap
+from sb3_crpn.theory.__main__ import table as theory_table
 
 ROOT = Path(__file__).parents[1]
 LEARNING = Path(__file__).parent / "learning"
-# Columns of the table at equal settings: algorithm and setting of their rows
+# Columns of the table at equal settings: the labels of their runs
 EQUAL_ARMS = {
-    "CRPN": ("CRPN", ""),
-    "ACRPN": ("ACRPN", ""),
-    "CRPN, H = 0": ("CRPN", "hessian_shrinkage=0.0"),
-    "TRPO": ("TRPO-equal", ""),
+    "CRPN": "CRPN",
+    "ACRPN": "ACRPN",
+    "CRPN, H = 0": "CRPN (hessian_shrinkage=0.0)",
+    "TRPO": TRPO_EQUAL,
 }
 MIN_SEEDS = 3
 BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -52,6 +55,8 @@ def main() -> None:
             stale.append(str(page.relative_to(ROOT)))
             if not check:
                 page.write_text(written)
+    if not check:
+        draw(ROOT / "docs" / "learning_curve.png")
     print("differ:" if check else "written:", ", ".join(stale) or "none")
     sys.exit(1 if check and stale else 0)
 
@@ -76,78 +81,55 @@ def _results(folder: str, baseline: str) -> Comparison:
 def published() -> str:
     """CRPN, ACRPN and TRPO, each with its published entry: the whole table."""
     found = _results(store.RESULTS.name, "TRPO")
-    rows = [
-        ["environment", "seeds", "CRPN, mean", "ACRPN, mean", "TRPO, mean", "CRPN, final",
-         "TRPO, final", "CRPN's CPU time / TRPO's"]
-    ]  # fmt: skip
+    head = ["environment", "seeds", "CRPN, mean", "ACRPN, mean", "TRPO, mean", "CRPN, final",
+            "TRPO, final", "CRPN's CPU time / TRPO's"]  # fmt: skip
+    rows = []
     for task in found.tasks:
         seeds = str(len(found.values("CRPN", task, "mean_return")))
         means = _cells(found, ("CRPN", "ACRPN", "TRPO"), task, "mean_return")
         finals = _cells(found, ("CRPN", "TRPO"), task, "final_return")
-        cost = tables.mean_cell(found.paired_ratios("CRPN", task, "cpu_seconds"), digits=2)
+        cost = tables.mean_cell(found.paired_ratios("CRPN", task, "cpu_seconds"), ",.2f")
         rows.append([task, seeds, *means, *finals, cost])
-    return _markdown(rows)
+    return markdown(head, rows)
 
 
 def headline() -> str:
     """Mean returns over training at equal settings; while none are measured, of the entries."""
-    found = equal_runs()
-    if found.empty:
+    found = equal.load((store.RESULTS, equal.RESULTS))
+    body = []
+    for task in found.tasks:
+        n_seeds = len(found.values(TRPO_EQUAL, task, "mean_return"))
+        if n_seeds >= MIN_SEEDS:
+            cells = _cells(found, list(EQUAL_ARMS.values()), task, "mean_return")
+            body.append([task, n_seeds, *cells])
+    if not body:
         note = "Mean return over training, each algorithm with its published hyperparameters."
         return f"{note}\n\n{_entries()}"
     note = (
         "Mean return over training. All arms have CRPN's hyperparameters: environments, timesteps "
         "of an update, γ, λ, network, first noise, KL target and critic work."
     )
-    rows = [["environment", "seeds", *EQUAL_ARMS]]
-    for env, runs in found.groupby("env", sort=False):
-        returns = [runs[runs.arm == arm].mean_return.to_numpy(float) for arm in EQUAL_ARMS]
-        rows.append([str(env), str(len(returns[0])), *map(tables.mean_cell, returns)])
-    return f"{note}\n\n{_markdown(rows)}"
-
-
-def equal_runs() -> pd.DataFrame:
-    """Return the runs of the equal-settings arms, of the seeds that all arms of a task have."""
-    columns = [*store.KEYS, "hyperparameters", "mean_return"]
-    published = _results(store.RESULTS.name, "TRPO").runs[columns]
-    own = store.read_runs(LEARNING / "equal")[columns]
-    found = []
-    for env, budget in BUDGETS.items():
-        runs = pd.concat([published, own], ignore_index=True) if len(own) else published
-        runs = runs[(runs.env == env) & (runs.timesteps == budget)]
-        arms = {arm: _arm(runs, *choice) for arm, choice in EQUAL_ARMS.items()}
-        seeds = set.intersection(*(set(rows.seed) for rows in arms.values()))
-        if len(seeds) >= MIN_SEEDS:
-            found += [r[r.seed.isin(seeds)].assign(arm=arm) for arm, r in arms.items()]
-    return pd.concat(found) if found else pd.DataFrame(columns=[*columns, "arm"])
-
-
-def _arm(runs: pd.DataFrame, algo: str, setting: str) -> pd.DataFrame:
-    rows = runs[runs.algo == algo]
-    own = rows[rows.setting == setting]
-    if own.empty:  # the entry has the setting already: the same run
-        own = rows[(rows.setting == "") & rows.hyperparameters.str.contains(setting, regex=False)]
-    return own.drop_duplicates("seed", keep="last").sort_values("seed")
+    return f"{note}\n\n{markdown(['environment', 'seeds', *EQUAL_ARMS], body)}"
 
 
 def _entries() -> str:
     found = _results(store.RESULTS.name, "TRPO")
     learners = ("CRPN", "ACRPN", "TRPO")
-    rows = [["environment", "seeds", *learners]]
+    head, rows = ["environment", "seeds", *learners], []
     for task in found.tasks:
         seeds = str(len(found.values("CRPN", task, "mean_return")))
         rows.append([task, seeds, *_cells(found, learners, task, "mean_return")])
-    return _markdown(rows)
+    return markdown(head, rows)
 
 
 def learners() -> str:
     """Mean return over training of every learner, on the environments that most of them ran on."""
     found = _results(store.RESULTS.name, "TRPO")
     tasks = found.tasks[:7]
-    rows = [["mean return over training", *tasks]]
+    head, rows = ["mean return over training", *tasks], []
     for label in found.learners:
         rows.append([label, *(_cells(found, (label,), task, "mean_return")[0] for task in tasks)])
-    return _markdown(rows)
+    return markdown(head, rows)
 
 
 def ablation() -> str:
@@ -155,30 +137,46 @@ def ablation() -> str:
     found = _results("ablation", "CRPN (defaults)")
     tasks = found.comparable_tasks(found.learners, "mean_return")
     scores = found.scores(found.learners, tasks, "mean_return")
-    rows = [["changed", "IQM", *(task.split(" (")[0] for task in tasks)]]
+    head, rows = ["changed", "IQM", *(task.split(" (")[0] for task in tasks)], []
     for label in found.learners:
-        mean = tables._cell(stratified_bootstrap(scores[label], interquartile_mean))
+        mean = estimate(stratified_bootstrap(scores[label], interquartile_mean))
         cells = (_cells(found, (label,), task, "mean_return")[0] for task in tasks)
         changed = re.sub(r"^CRPN \(defaults,?(.*)\)$", r"`\1`", label).replace(",", ", ")
         rows.append([changed if label != found.baseline else "nothing", mean, *cells])
-    return _markdown(rows)
+    return markdown(head, rows)
+
+
+def ranks() -> str:
+    """Return the times of several ranks and of one process, and the cost model."""
+    return "\n\n".join(distributed.tables(distributed.RESULTS.read()))
 
 
 def _cells(found: Comparison, labels: Sequence[str], task: str, column: str) -> list[str]:
     return [tables.mean_cell(found.values(label, task, column)) for label in labels]
 
 
-def _markdown(rows: list[list[str]]) -> str:
-    header, *body = rows
-    lines = [header, ["---"] * len(header), *body]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+def draw(path: Path) -> None:
+    """Draw CRPN's default settings on CartPole-v1: each seed, and their mean."""
+    found = _results("ablation", "CRPN (defaults)")
+    curves = found.learning_curves(found.baseline, "CartPole-v1 (50,000 steps)")
+    figure = Figure(figsize=(7.0, 4.5), layout="constrained")
+    axes = figure.subplots()
+    axes.axhline(475, color="gray", ls="--", lw=1, label="solved: 475")
+    axes.plot(curves.index, curves, color="C0", lw=1, alpha=0.4)
+    axes.plot(curves.index, curves.mean(axis=1), color="C0", lw=2, label="mean of the seeds")
+    axes.set(xlabel="timesteps", ylabel="return of training episodes", ylim=(0, 520))
+    axes.set_title(f"CRPN on CartPole-v1, default settings, {curves.shape[1]} seeds")
+    axes.legend(loc="lower right")
+    figure.savefig(path, dpi=120)
 
 
 TABLES: dict[str, Callable[[], str]] = {
     "ablation": ablation,
+    "distributed": ranks,
     "headline": headline,
     "learners": learners,
     "published": published,
+    "theory": theory_table,
 }
 
 if __name__ == "__main__":

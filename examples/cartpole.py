@@ -1,7 +1,7 @@
 """Train CRPN on CartPole-v1, evaluate it while it learns, and draw its learning curve.
 
-python examples/cartpole.py            # one seed: models and picture go to runs/
-python examples/cartpole.py --seeds 5  # the picture of the README
+python examples/cartpole.py            # one seed: model and picture go to runs/
+python examples/cartpole.py --seeds 5  # five seeds in one picture
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import argparse
 from datetime import datetime
 from pathlib import Path
 
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from stable_baselines3.common.callbacks import EvalCallback
@@ -56,17 +56,17 @@ def train(run: Path, seed: int, timesteps: int) -> None:
 
 
 def draw(runs: list[Path], picture: Path) -> None:
-    """Draw all runs' training episodes, their means over 100, and the evaluations."""
-    matplotlib.use("Agg")
-    figure, axes = matplotlib.pyplot.subplots(figsize=(7.0, 5.0), layout="constrained")
+    """Draw all runs' training episodes, their means over 10, and the evaluations."""
+    plt.switch_backend("Agg")
+    figure, axes = plt.subplots(figsize=(7.0, 5.0), layout="constrained")
     axes.axhline(SOLVED, color="gray", ls="--", lw=1, label=f"solved: {SOLVED}")
     for number, run in enumerate(runs):
         first = number == 0
         episodes = load_results(str(run / "training"))
         steps, returns = episodes.l.cumsum(), episodes.r
         axes.plot(steps, returns, ".", color="C0", ms=2, alpha=0.2)
-        mean = returns.rolling(100, min_periods=1).mean()
-        axes.plot(steps, mean, color="C0", label="training, mean of 100 episodes" * first)
+        mean = returns.rolling(10, min_periods=1).mean()
+        axes.plot(steps, mean, color="C0", label="training, mean of 10 episodes" * first)
         saved = np.load(run / "evaluations.npz")
         evaluated = saved["results"].mean(axis=1)
         axes.plot(

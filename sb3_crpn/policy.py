@@ -102,9 +102,10 @@ def find_actor(policy: ActorCriticPolicy, observations: Observations) -> ActorPa
     ValueError
         log π depends on no trainable parameter, or π(·|s) is not finite.
     """
-    distribution = action_distribution(policy, observations)
-    log_prob = distribution.log_prob(distribution.mode().detach())
-    return ActorParameters.reachable(policy, log_prob)
+    with torch.enable_grad():
+        distribution = action_distribution(policy, observations)
+        log_prob = distribution.log_prob(distribution.mode().detach())
+        return ActorParameters.reachable(policy, log_prob)
 
 
 def find_actor_anywhere(policy: ActorCriticPolicy, space: spaces.Space[Any]) -> ActorParameters:

@@ -92,7 +92,8 @@ class GymnasiumVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Take one step in every environment; begin the next episode where one has ended."""
-        obs, rewards, terminated, truncated, infos = self.env.step(self._actions)
+        obs, rewards, *ends, infos = self.env.step(self._actions)
+        terminated, truncated = np.asarray(ends).astype(np.bool_)  # 0 and 1 are no masks
         leaves, env_infos = self._leaves(obs), self._split(infos)
         self._returns += rewards
         self._lengths += 1

@@ -5,7 +5,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from gymnasium.wrappers import FlattenObservation, TimeLimit
 from gymnasium.wrappers import vector as wrappers
 from sb3_contrib import TRPO
@@ -281,6 +281,42 @@ class BatchedSameStep(VectorEnv):
         if self.final:
             infos["final_obs"] = np.array([[5.0], [0.0]])
         return np.zeros((2, 1), np.float16), np.ones(2, np.float16), ~ends & ends, ends, infos
+
+
+class FlagsOfType(VectorWrapper):
+    """Returns ``terminated`` and ``truncated`` as numbers, or as lists."""
+
+    def __init__(self, env, convert):
+        super().__init__(env)
+        self.convert = convert
+
+    def step(self, actions):
+        obs, rewards, *ends, infos = self.env.step(actions)
+        return obs, rewards, *map(self.convert, ends), infos
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize("convert", [np.int64, np.float32, list])
+def test_flags_of_any_type_are_handed_on_as_bool(mode, convert):
+    adapted, expected = (
+        GymnasiumVecEnv(FlagsOfType(SyncVectorEnv(make_fns(), autoreset_mode=mode), kind))
+        for kind in (convert, np.bool_)
+    )
+    for env in (adapted, expected):
+        env.seed(3)
+        env.reset()
+    n_ended = 0
+    for _ in range(30):
+        actions = np.zeros(N_ENVS, int)
+        outcome, reference = adapted.step(actions), expected.step(actions)
+        assert outcome[2].dtype == np.bool_
+        for own, other in zip(outcome[:3], reference[:3], strict=True):
+            np.testing.assert_array_equal(own, other)
+        for own, other in zip(outcome[3], reference[3], strict=True):
+            assert own["TimeLimit.truncated"] is other["TimeLimit.truncated"]
+            assert own.keys() == other.keys()
+        n_ended += outcome[2].sum()
+    assert n_ended > N_ENVS
 
 
 def test_third_party_same_step_environment():

@@ -141,7 +141,11 @@ class Comparison:
 
 def load(folder: Path, baseline: str) -> Comparison:
     """Read a results folder."""
-    runs, curves = store.read_runs(folder), store.read_curves(folder)
+    return compare(store.read_runs(folder), store.read_curves(folder), baseline)
+
+
+def compare(runs: pd.DataFrame, curves: pd.DataFrame, baseline: str) -> Comparison:
+    """Return the comparison of rows of runs, of which outdated ones are left out."""
     is_current = _are_current(runs)
     keys = list(store.KEYS)
     curves = curves.merge(runs.loc[is_current, keys], on=keys)

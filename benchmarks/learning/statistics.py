@@ -22,8 +22,13 @@ def stratified_bootstrap(
 ) -> Estimate:
     """Return a statistic with percentile bounds; seeds are resampled within each environment.
 
-    What the scores were normalised by is taken as known, as in rliable.
+    What the scores were normalised by is taken as known, as in rliable. Environments of one seed
+    alone have no interval (NaN).
     """
+    value = statistic(samples)
+    if all(len(s) < 2 for s in samples):
+        none = np.full_like(value, np.nan, dtype=float)
+        return Estimate(value, none, none)
     rng = np.random.default_rng(0)
     resampled = [
         statistic([s[rng.integers(len(s), size=len(s))] for s in samples])
@@ -31,7 +36,7 @@ def stratified_bootstrap(
     ]
     tail = (1 - CONFIDENCE) / 2
     low, high = np.quantile(resampled, [tail, 1 - tail], axis=0)
-    return Estimate(statistic(samples), low, high)
+    return Estimate(value, low, high)
 
 
 def interquartile_mean(samples: Sequence[Array]) -> float:
@@ -52,6 +57,11 @@ def interquartile_mean(samples: Sequence[Array]) -> float:
     upper = np.cumsum(weights[order])
     inside = np.clip(np.minimum(upper, 0.75) - np.maximum(upper - weights[order], 0.25), 0, None)
     return float(scores[order] @ inside / inside.sum())
+
+
+def mean_score(samples: Sequence[Array]) -> float:
+    """Return the mean over environments of the mean score over seeds."""
+    return float(np.mean([np.mean(s) for s in samples]))
 
 
 def performance_profile(samples: Sequence[Array], thresholds: Array) -> Array:

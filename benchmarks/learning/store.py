@@ -50,9 +50,17 @@ def read_curves(folder: Path) -> pd.DataFrame:
 
 def is_done(run: Run, done: pd.DataFrame) -> bool:
     """Return whether ``done``, rows of runs, has this one with the same hyperparameters."""
-    keys = [getattr(run, name) for name in KEYS]
-    rows = done[(done[list(KEYS)] == keys).all(axis=1)]
-    return any(same_hyperparameters(run.hyperparameters, row) for row in rows["hyperparameters"])
+    return bool((matches(run, done) & (done["setting"] == run.setting)).any())
+
+
+def matches(run: Run, rows: pd.DataFrame) -> pd.Series:
+    """Return which rows of runs have this one's hyperparameters, whatever their setting's name."""
+    keys = [name for name in KEYS if name != "setting"]
+    found = (rows[keys] == [getattr(run, name) for name in keys]).all(axis=1)
+    for index in found.index[found]:
+        description = rows.loc[index, "hyperparameters"]
+        found[index] = same_hyperparameters(run.hyperparameters, description)
+    return found
 
 
 def _runs(folder: Path) -> Table:

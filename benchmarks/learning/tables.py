@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -41,8 +41,12 @@ def report(comparison: Comparison) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def aggregate_table(comparison: Comparison, labels: Sequence[str]) -> str:
-    """Return interquartile means of normalised scores and probabilities of improvement."""
+def aggregate_table(
+    comparison: Comparison,
+    labels: Sequence[str],
+    means: Mapping[str, Callable[[Sequence[Array]], float]] = {"IQM": interquartile_mean},
+) -> str:
+    """Return means of normalised scores, by name, and probabilities of improvement."""
     baseline = comparison.baseline
     notes, columns = [], []
     for metric, name in METRICS.items():
@@ -51,8 +55,9 @@ def aggregate_table(comparison: Comparison, labels: Sequence[str]) -> str:
         if not tasks:
             continue
         scores = comparison.scores(labels, tasks, metric)
-        means = [stratified_bootstrap(scores[label], interquartile_mean) for label in labels]
-        columns.append([f"IQM, {name}", *map(estimate, means)])
+        for mean_name, mean in means.items():
+            found = [stratified_bootstrap(scores[label], mean) for label in labels]
+            columns.append([f"{mean_name}, {name}", *map(estimate, found)])
         better = [
             "-" if label == baseline else estimate(improvement(scores[label], scores[baseline]))
             for label in labels

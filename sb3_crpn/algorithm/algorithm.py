@@ -43,7 +43,7 @@ from sb3_crpn.episodes import (
     Replay,
     Tracker,
 )
-from sb3_crpn.episodes.collector import all_finite
+from sb3_crpn.episodes.observations import all_finite
 from sb3_crpn.episodes.running_moments import RunningMoments
 from sb3_crpn.parameters import ActorParameters
 from sb3_crpn.policy import find_actor, find_actor_anywhere, to_tensor

@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from sb3_crpn.arrays import Observations
 from sb3_crpn.episodes import EpisodeBatch
-from sb3_crpn.episodes.batch import map_observations
+from sb3_crpn.episodes.observations import map_observations
 from sb3_crpn.parameters import ActorParameters
 from sb3_crpn.policy import state_values
 
@@ -61,6 +61,7 @@ def fit_critic(
         return float("nan")
     # not in training mode: a normalisation layer's statistics may be the actor's too
     policy.set_training_mode(False)
+    _follow_replaced(policy)
     layer = _output_layer(policy, actor)
     shift, scale = (0.0, 1.0) if layer is None else _units(batch, largest)
     dtype = next(policy.parameters()).dtype
@@ -91,6 +92,22 @@ def fuse(optimizer: torch.optim.Optimizer) -> None:
         unset = group["fused"] is None and group["foreach"] is None
         if unset and devices <= {"cpu", "cuda"}:
             group["fused"] = True
+
+
+def _follow_replaced(policy: ActorCriticPolicy) -> None:
+    """Let the optimiser hold the policy's parameters where layers of it were replaced."""
+    optimizer = policy.optimizer
+    present = {parameter: index for index, parameter in enumerate(policy.parameters())}
+    held = {parameter for group in optimizer.param_groups for parameter in group["params"]}
+    if held <= present.keys():
+        return
+    for gone in held - present.keys():
+        optimizer.state.pop(gone, None)
+    for group in optimizer.param_groups:
+        group["params"] = [p for p in group["params"] if p in present]
+    first = optimizer.param_groups[0]["params"]
+    first += [parameter for parameter in present if parameter not in held]
+    first.sort(key=present.__getitem__)  # a saved state lists them by position
 
 
 def _minibatches(

@@ -88,7 +88,7 @@ class PolicyNewtonUpdate(RolloutAlgorithm):
         alpha = self._first_alpha(target_kl)
         step, accepted = take_step(evaluator, model, solver, alpha, target_kl)
         value_loss = self._fit_critic(batch, joined)
-        if step.evaluation.finite:  # what spoilt one step would spoil the next ones
+        if step.evaluation.finite:  # a rollout whose step was not finite is not reused
             self.replay.append(batch)
             if target_kl is not None:
                 self.kl_control.alpha = step.alpha
@@ -104,6 +104,7 @@ class PolicyNewtonUpdate(RolloutAlgorithm):
         )
         self.last_update.write(self.logger)
 
+    @torch.enable_grad()
     def estimate_curvature(self, n_episodes: int, env: VecEnv | None = None) -> CurvatureEstimate:
         """Estimate gradient and Hessian of J at the current policy from fresh episodes.
 
@@ -230,7 +231,7 @@ class PolicyNewtonUpdate(RolloutAlgorithm):
     def _fit_critic(self, batch: EpisodeBatch, joined: EpisodeBatch) -> float | None:
         """Regress V on the λ-returns; ``None`` where V is not used.
 
-        The earlier rollouts share in the minibatches of the fresh one, which become no more.
+        Reused rollouts share the minibatches of the fresh one: their number does not grow.
         """
         if not self.uses_critic:
             return None

@@ -103,7 +103,7 @@ def cubic_subsolver(
     norm = float(torch.linalg.vector_norm(g))
     if rho * norm >= lipschitz**2:
         return _report(g, operator, rho, _cauchy_step(g, operator, rho))
-    # Correction: σ = c'√(ερ)/ℓ is no gradient; ε√(ρε)/ℓ has its units
+    # Correction: σ = c'√(ερ)/ℓ, with a c' that the text lacks, is no gradient; ε√(ρε)/ℓ is one
     sigma = epsilon * math.sqrt(rho * epsilon) / lipschitz
     perturbed = g + sigma * random_unit_vector(g, seed)
     target = _UNNOTICED * sigma / math.sqrt(g.numel())
@@ -197,7 +197,10 @@ def cauchy_radius(norm: float, curvature: float, rho: float) -> float:
 
 
 def _cauchy_step(g: Tensor, operator: CountedOperator, rho: float) -> _Descent:
-    """Minimise the model along -g: one product; none, and no step, where g = 0."""
+    """Minimise the model along -g: one product; none, and no step, where g = 0.
+
+    Correction: Algorithm 2's R_c mixes ḡ and g, which is nowhere defined, and has ‖ḡ²‖ for ‖ḡ‖².
+    """
     norm = float(torch.linalg.vector_norm(g))
     if norm == 0:
         return _Descent(
@@ -216,8 +219,9 @@ def _descend(
 ) -> _Descent:
     """Run gradient descent on the model from 0 until ‖∇m‖ ≤ target; one product a step.
 
-    Correction: the gradient is recomputed, ∇m = g + H[Δ] + (ρ/2)‖Δ‖Δ; as printed, the
-    Finalsolver's recursion adds it to its predecessor and never stops.
+    Correction: the slope is ∇m = g + H[Δ] + (ρ/2)‖Δ‖Δ. The Finalsolver as printed,
+    ḡ_J ← ḡ_J + H[Δ] + (ρ/2)‖Δ‖Δ, adds up the slopes of all iterates. It stops where the sum is
+    small, if it does; ∇m is hardly ever small there.
     """
     step, product = torch.zeros_like(g), torch.zeros_like(g)
     # with ‖H‖ ≤ ℓ, m > 0 beyond the root of (ρ/6)R² = (ℓ/2)R + ‖g‖, and descent keeps m ≤ 0
@@ -245,7 +249,7 @@ def _report(g: Tensor, operator: CountedOperator, rho: float, descent: _Descent)
     return CubicStep(
         step=step,
         multiplier=multiplier,
-        # Correction: δ_J is the model at Δ with g, where the paper has the perturbed g̃
+        # -δ_J of Algorithm 2, J̄_k(θ_k) - J̄_k(θ_k + Δ): the model with ḡ, not with the perturbed g̃
         predicted_decrease=0.0 - float(g @ step + step @ product / 2) - rho / 6 * norm**3,
         products=operator.count,
         residual=float(torch.linalg.vector_norm(product + multiplier * step + g)),
@@ -259,9 +263,9 @@ def _descent_steps(
 ) -> int:
     """Return N̂.
 
-    Correction: it is of the order ℓ/√(ρε)·log, not a constant. A direction of curvature -√(ρε)
-    grows by 1 + √(ρε)/(20ℓ) a step, from the perturbation's share σ/(20ℓ√d) to the length
-    √(ε/ρ) where the cubic term takes over.
+    Correction: the paper's N̂ = 1/√ε lacks ℓ/√ρ, and with it has no units, and a logarithm. A
+    direction of curvature -√(ρε) grows by 1 + √(ρε)/(20ℓ) a step, from the perturbation's share
+    σ/(20ℓ√d) to the length √(ε/ρ) where the cubic term takes over.
     """
     if given is not None:
         return given

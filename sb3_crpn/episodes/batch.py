@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
@@ -20,6 +20,7 @@ from sb3_crpn.distributed import (
     rank,
     world_size,
 )
+from sb3_crpn.episodes.observations import map_observations
 
 
 def episode_starts(lengths: IntArray) -> IntArray:
@@ -290,12 +291,3 @@ def _join(parts: Sequence[Any]) -> Any:
     if isinstance(parts[0], dict):
         return {key: _join([part[key] for part in parts]) for key in parts[0]}
     return torch.cat(list(parts)) if isinstance(parts[0], torch.Tensor) else np.concatenate(parts)
-
-
-def map_observations(
-    observations: Observations, function: Callable[[torch.Tensor], torch.Tensor]
-) -> Observations:
-    """Apply ``function`` to the observation tensor, or to each one of a dict."""
-    if isinstance(observations, dict):
-        return {key: function(tensor) for key, tensor in observations.items()}
-    return function(observations)

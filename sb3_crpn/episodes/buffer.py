@@ -15,6 +15,7 @@ from stable_baselines3.common.type_aliases import DictRolloutBufferSamples, Roll
 from sb3_crpn.arrays import Array, FloatArray, IntArray, Observations
 from sb3_crpn.episodes.advantages import cost_advantages, generalized_advantages
 from sb3_crpn.episodes.batch import EpisodeBatch, episode_time
+from sb3_crpn.episodes.observations import stack_observations
 from sb3_crpn.episodes.tracker import Segment
 from sb3_crpn.policy import state_values, to_tensor, values_and_log_probs
 
@@ -224,16 +225,6 @@ class EpisodeRolloutBuffer(RolloutBuffer):
 
 class DictEpisodeRolloutBuffer(EpisodeRolloutBuffer, DictRolloutBuffer):
     """:class:`EpisodeRolloutBuffer` for dict observations."""
-
-
-def stack_observations(observations: list[Any]) -> Any:
-    """Lay single observations of equal shapes, arrays or dicts of them, along a first axis."""
-    if isinstance(observations[0], dict):
-        return {
-            key: np.stack([observation[key] for observation in observations])
-            for key in observations[0]
-        }
-    return np.stack(observations)
 
 
 def values_of(policy: ActorCriticPolicy, observations: Any) -> FloatArray:

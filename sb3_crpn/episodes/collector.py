@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_crpn.arrays import Array, BoolArray, FloatArray, IntArray, Observations
 from sb3_crpn.episodes.buffer import EpisodeRolloutBuffer
+from sb3_crpn.episodes.observations import all_finite, as_arrays, as_observation
 from sb3_crpn.episodes.running_moments import RunningMoments
 from sb3_crpn.episodes.tracker import RolloutSize, Segment, Tracker
 from sb3_crpn.policy import environment_actions, sample_actions, to_tensor
@@ -97,21 +97,21 @@ class Collector:
     @property
     def at_episode_start(self) -> BoolArray:
         """Whether each environment stands at the start of a trajectory, [n_envs]."""
-        at_start: BoolArray = self.times == 0
-        return at_start
+        starts: BoolArray = self.times == 0
+        return starts
 
     def stand(self, observations: Any, times: IntArray) -> None:
         """Say where the environments stand; ``None``: reset them."""
         if observations is None:
             self.reset()
             return
-        self.observations, self.times = _as_arrays(observations), times
+        self.observations, self.times = as_arrays(observations), times
         self._require_finite("observation", self.observations)
 
     def reset(self) -> None:
         """Reset all environments."""
         before = None if self._moments is None else self._moments.snapshot()
-        self.observations = _as_arrays(self.env.reset())
+        self.observations = as_arrays(self.env.reset())
         self.times = np.zeros(self.env.num_envs, dtype=np.int64)
         self._require_finite("observation", self.observations, before)
 
@@ -190,7 +190,7 @@ class Collector:
         new_obs, rewards, dones, infos = self.env.step(clipped_actions)
         self._n_steps += 1
         self.timestep += self.env.num_envs
-        new_obs, rewards = _as_arrays(new_obs), np.asarray(rewards)
+        new_obs, rewards = as_arrays(new_obs), np.asarray(rewards)
         self._require_finite("reward", rewards, before)
         self._require_finite("observation", new_obs, before)
         dones = np.asarray(dones).astype(np.bool_)
@@ -271,34 +271,6 @@ class Collector:
                 "pass horizon=H to cut them after H steps, wrap the environment in "
                 'gymnasium.wrappers.TimeLimit, or learn from timesteps with rollout="timesteps"'
             )
-
-
-def all_finite(value: Any) -> bool:
-    """Tell whether an array, or each one of a dict, is free of NaN and infinity."""
-    arrays = value.values() if isinstance(value, dict) else (value,)
-    return all(
-        np.isfinite(array).all() for array in arrays if np.issubdtype(array.dtype, np.floating)
-    )
-
-
-def as_observation(space: spaces.Space[Any], observation: Any) -> Any:
-    """Return one observation as an array of the space's shape and dtype, or a dict of them.
-
-    Environments may return Python numbers, lists, or dicts of such.
-    """
-    if isinstance(space, spaces.Dict):
-        return {
-            key: as_observation(subspace, observation[key])
-            for key, subspace in space.spaces.items()
-        }
-    return np.asarray(observation, dtype=space.dtype).reshape(space.shape or ())
-
-
-def _as_arrays(observations: Any) -> Any:
-    """Return a batch of observations as an array, or a dict of arrays."""
-    if isinstance(observations, dict):
-        return {key: np.asarray(array) for key, array in observations.items()}
-    return np.asarray(observations)
 
 
 def _early_resets_allowed(env: VecEnv) -> bool:

@@ -41,7 +41,7 @@ class Replay:
     Parameters
     ----------
     size
-        Most rollouts that are kept.
+        Maximum number of rollouts.
     gamma, gae_lambda
         γ and λ.
     """
@@ -52,11 +52,11 @@ class Replay:
         self._gae_lambda = gae_lambda
 
     def append(self, batch: EpisodeBatch) -> None:
-        """Keep a rollout in place of the oldest."""
+        """Add a rollout; beyond ``size`` it replaces the oldest."""
         self._batches.append(batch)
 
     def clear(self) -> None:
-        """Forget all."""
+        """Drop all rollouts."""
         self._batches.clear()
 
     def reweighted(self, policy: ActorCriticPolicy, **weighting: bool) -> list[EpisodeBatch]:

@@ -105,10 +105,10 @@ class EpisodeTracker:
     """Keeps a fixed quota of whole episodes from each environment, without length bias.
 
     Taking the first m episodes to finish over parallel environments favours short ones. Here each
-    environment delivers its first q_e episodes, however long they take; q_e is fixed before the
-    rollout starts. What an environment runs beyond its quota is thrown away. An environment is
-    *recording* an episode, *waiting* for its next one to start (it is in the middle of an episode
-    that does not count), or has met its quota.
+    environment delivers its first q_e episodes, whatever their length; q_e is fixed before the
+    rollout starts. Steps beyond the quota are not learnt from. An environment *records* an
+    episode, *waits* for its next one to start (the present one began before the rollout, or was
+    cut), or has met its quota.
     """
 
     whole_episodes: ClassVar[bool] = True

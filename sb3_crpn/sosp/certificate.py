@@ -27,7 +27,8 @@ from sb3_crpn.checks import (
     real,
     requires,
 )
-from sb3_crpn.episodes.batch import EpisodeBatch, map_observations
+from sb3_crpn.episodes.batch import EpisodeBatch
+from sb3_crpn.episodes.observations import map_observations
 from sb3_crpn.parameters import ActorParameters
 from sb3_crpn.policy import find_actor
 from sb3_crpn.sosp.batch_means import BatchMeans
@@ -57,6 +58,7 @@ _CHECKS: dict[str, Check] = {
 }
 
 
+@torch.enable_grad()
 def certify_sosp(
     model: OnPolicyAlgorithm,
     n_episodes: int,

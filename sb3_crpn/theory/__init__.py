@@ -7,11 +7,19 @@
 ['alpha', 'gamma', 'horizon', 'n_episodes', 'n_hessian_episodes']
 
 Symbols are those of Maniyar et al., AISTATS 2024. Their values are derived here, in the docstrings,
-and tested against enumerated decision processes; they may be smaller than the printed ones.
+and tested against enumerated decision processes. The paper's own are in `printed`, under names that
+begin with "printed"; ``python -m sb3_crpn.theory`` compares the two.
 """
 
 from sb3_crpn.theory.constants import Constants
 from sb3_crpn.theory.policies import ScoreBounds, gaussian_linear, softmax_linear
+from sb3_crpn.theory.printed import (
+    PrintedConstants,
+    printed_approximate_complexity,
+    printed_approximate_recipe,
+    printed_expectation_recipe,
+    printed_high_probability_recipe,
+)
 from sb3_crpn.theory.recipes import (
     Recipe,
     approximate_recipe,
@@ -21,11 +29,16 @@ from sb3_crpn.theory.recipes import (
 
 __all__ = [
     "Constants",
+    "PrintedConstants",
     "Recipe",
     "ScoreBounds",
     "approximate_recipe",
     "expectation_recipe",
     "gaussian_linear",
     "high_probability_recipe",
+    "printed_approximate_complexity",
+    "printed_approximate_recipe",
+    "printed_expectation_recipe",
+    "printed_high_probability_recipe",
     "softmax_linear",
 ]

@@ -53,8 +53,8 @@ _STEP_DIVISOR = 20.0
 # κ, the negative curvature, as a part of √(ρε), that the descent must make out
 _VISIBLE_CURVATURE = 0.25
 
-_CONSTANTS = requires("a Constants", lambda value: isinstance(value, Constants))
-_PROBABILITY = real(0.0, 1.0, open_low=True, open_high=True)
+CONSTANTS = requires("a Constants", lambda value: isinstance(value, Constants))
+PROBABILITY = real(0.0, 1.0, open_low=True, open_high=True)
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,8 @@ class Recipe:
     sosp_step_norm
         A step no longer than this leads to an ε-SOSP (with the high-probability recipe's
         probability); ``None`` where the theorem does not say which of the iterates is one.
+    gradient_factor, curvature_factor
+        The guarantee in units of ε and √(ρε): 1 and 1 of an ε-SOSP; as printed, 25 and 7.
     """
 
     kwargs: Mapping[str, Any]
@@ -79,6 +81,28 @@ class Recipe:
     epsilon: float
     rho: float
     sosp_step_norm: float | None = None
+    gradient_factor: float = 1.0
+    curvature_factor: float = 1.0
+
+    @property
+    def gradient_bound(self) -> float:
+        """The bound on ‖∇J‖ that is guaranteed."""
+        return self.gradient_factor * self.epsilon
+
+    @property
+    def curvature_bound(self) -> float:
+        """The bound on -λ_min(∇²J) that is guaranteed."""
+        return self.curvature_factor * math.sqrt(self.rho * self.epsilon)
+
+    @property
+    def gradient_episodes(self) -> int:
+        """Σ_k m_k."""
+        return int(self.n_updates * self.kwargs["n_episodes"])
+
+    @property
+    def hessian_episodes(self) -> int:
+        """Σ_k b_k."""
+        return int(self.n_updates * self.kwargs["n_hessian_episodes"])
 
     @property
     def episodes_per_update(self) -> int:
@@ -126,7 +150,7 @@ def expectation_recipe(
     gradient_error, hessian_error = _allowed_errors(constants, epsilon, _EXACT)
     m = math.ceil((constants.gradient_error(1) / gradient_error) ** 2)
     b = math.ceil((constants.hessian_error(1) / hessian_error) ** 2)
-    kwargs = {**_batches(constants, m, b), "alpha": 3.0 * constants.L_H}
+    kwargs = {**batches(constants, m, b), "alpha": 3.0 * constants.L_H}
     return Recipe(kwargs, n_updates, epsilon, constants.L_H)
 
 
@@ -160,11 +184,11 @@ def high_probability_recipe(
     epsilon, n_updates = _checked(
         "high_probability_recipe", constants, epsilon, initial_gap, _EXACT
     )
-    failure_probability = _PROBABILITY(
+    failure_probability = PROBABILITY(
         "high_probability_recipe: failure_probability", failure_probability
     )
     m, b = _bernstein(constants, epsilon, failure_probability, n_updates, _EXACT)
-    kwargs = {**_batches(constants, m, b), "alpha": 3.0 * constants.L_H}
+    kwargs = {**batches(constants, m, b), "alpha": 3.0 * constants.L_H}
     longest = _LONGEST_SOSP_STEP * math.sqrt(epsilon / constants.L_H)
     return Recipe(kwargs, n_updates, epsilon, constants.L_H, longest)
 
@@ -191,9 +215,10 @@ def approximate_recipe(
 
     A Cauchy step is taken only where ‖g‖ ≥ ℓ²/ρ, and gains far more: -m(Δ) ≥ ⅓√(‖g‖³/ρ).
 
-    Corrections to the paper: σ = c'√(ερ)/ℓ is no gradient, ε√(ρε)/ℓ has its units; and N̂ is no
-    constant: a direction of curvature -κ√(ρε) grows by 1 + κ√(ρε)/(20ℓ) a step, from σ/(20ℓ√d) to
-    √(ε/ρ), whence N̂ = (20/κ)(ℓ/√(ρε)) log(1 + 20√d ℓ²/(ρε)). κ = ¼, since a decrease of 1/100 must
+    Where the paper differs: its σ = c'√(ερ)/ℓ is no gradient, ε√(ρε)/ℓ has its units; and its
+    N̂ = 1/√ε lacks ℓ/√ρ and a logarithm. A direction of curvature -κ√(ρε) grows by
+    1 + κ√(ρε)/(20ℓ) a step, from σ/(20ℓ√d) to √(ε/ρ), whence
+    N̂ = (20/κ)(ℓ/√(ρε)) log(1 + 20√d ℓ²/(ρε)). κ = ¼, since a decrease of 1/100 must
     not be missed, which a curvature of -0.25√(ρε) alone allows.
 
     Parameters
@@ -211,7 +236,7 @@ def approximate_recipe(
     epsilon, n_updates = _checked(
         "approximate_recipe", constants, epsilon, initial_gap, _APPROXIMATE
     )
-    failure_probability = _PROBABILITY(
+    failure_probability = PROBABILITY(
         "approximate_recipe: failure_probability", failure_probability
     )
     m, b = _bernstein(constants, epsilon, failure_probability, n_updates, _APPROXIMATE)
@@ -221,7 +246,7 @@ def approximate_recipe(
     condition = max(largest, _LEAST_CONDITION)
     growth = math.log1p(_STEP_DIVISOR * math.sqrt(constants.d) * condition**2)
     kwargs = {
-        **_batches(constants, m, b),
+        **batches(constants, m, b),
         "alpha": constants.L_H,
         "sosp_epsilon": epsilon,
         "gradient_lipschitz": condition * curvature,
@@ -231,8 +256,8 @@ def approximate_recipe(
     return Recipe(kwargs, n_updates, epsilon, constants.L_H)
 
 
-def _batches(constants: Constants, m: int, b: int) -> dict[str, Any]:
-    """Return m, b and what the constants suppose of an episode."""
+def batches(constants: Constants, m: int, b: int) -> dict[str, Any]:
+    """Return m, b and what the constants suppose of an episode, as keyword arguments."""
     return {
         "n_episodes": m,
         "n_hessian_episodes": b,
@@ -245,7 +270,7 @@ def _checked(
     function: str, constants: Constants, epsilon: float, initial_gap: float | None, plan: _Plan
 ) -> tuple[float, int]:
     """Return ε and the least N whose gains exceed J(θ_0) - J*, for good arguments."""
-    constants = _CONSTANTS(f"{function}: constants", constants)
+    constants = CONSTANTS(f"{function}: constants", constants)
     largest = constants.M_H**2 / constants.L_H
     epsilon = real(0.0, largest, open_low=True)(f"{function}: epsilon", epsilon)
     if initial_gap is None:

@@ -14,7 +14,7 @@ from scipy import stats
 from benchmarks.common.intervals import interval
 from benchmarks.learning import comparison, equal, report, rollouts, store, tables
 from benchmarks.learning.__main__ import main
-from benchmarks.learning.run import N_BINS, Result, Run, learning_curve
+from benchmarks.learning.run import N_BINS, Result, Run, learning_curve, make_run
 from benchmarks.learning.settings import (
     ALGORITHMS,
     BUDGETS,
@@ -29,6 +29,7 @@ from benchmarks.learning.settings import (
 from benchmarks.learning.statistics import (
     improvement,
     interquartile_mean,
+    mean_score,
     performance_profile,
     stratified_bootstrap,
 )
@@ -153,6 +154,33 @@ def test_the_arms_at_equal_settings() -> None:
     assert arms == expected
     assert len(runs) == 4 * 10 + 3 * 5
     assert sorted(env for stage, _ in equal.STAGES for env in stage) == sorted(BUDGETS)
+
+
+def test_the_report_at_equal_settings_has_the_seeds_that_all_arms_have(tmp_path: Path) -> None:
+    peers, folder = tmp_path / "peers", tmp_path / "equal"
+    for run in equal.wanted_runs(["CartPole-v1", "Walker2d-v5"], 1000):
+        if run.seed < 3 - (run.algo == "ACRPN"):
+            of_peers = run.algo == "ACRPN"  # rows without a number of updates
+            level = {"ACRPN": 40.0, "CRPN": 60.0, TRPO_EQUAL: 50.0}[run.algo]
+            result = _result(level + run.seed, np.array([1.0]))
+            store.append(peers if of_peers else folder, run, result)
+    other = make_run("CRPN", "CartPole-v1", 0, {"gamma": 0.5}, timesteps=1000)
+    store.append(folder, other, _result(9.0, np.array([1.0])))
+    for seed in range(4):
+        random = make_run("Random", "CartPole-v1", seed, {}, timesteps=1000)
+        store.append(peers, random, _result(0.0, np.array([])))
+    found = equal.load((peers, folder), 1000)
+    assert found.complete_learners == found.learners
+    task = "CartPole-v1 (1,000 steps)"
+    arms = ["CRPN", "CRPN (hessian_shrinkage=0.0)", "ACRPN", TRPO_EQUAL]
+    assert sorted(found.learners) == sorted(arms)
+    for arm in arms:
+        assert found.values(arm, task, "seed").tolist() == [0, 1]
+    walker = "Walker2d-v5 (1,000 steps)"
+    np.testing.assert_array_equal(found.values(arms[1], walker, "mean_return"), [60, 61])
+    text = equal.report(found)
+    assert "| CRPN | 1.20 [" in text  # 60.5 / 50.5
+    assert f"| {task} | 33,333 | 33,333 | 33,333 | 33,333 |" in text
 
 
 def test_rollouts_differ_in_nothing_else() -> None:
@@ -310,6 +338,16 @@ def test_stratified_intervals_of_one_environment_are_plain_ones() -> None:
     values = np.random.default_rng(2).normal(size=400)
     found = stratified_bootstrap([values], lambda s: float(s[0].mean()))
     assert found == pytest.approx(interval(values), abs=0.01)
+
+
+def test_one_seed_an_environment_has_no_interval() -> None:
+    value, low, high = stratified_bootstrap([np.ones(1), np.zeros(1)], mean_score)
+    assert value == 0.5
+    assert np.isnan([low, high]).all()
+
+
+def test_the_mean_score_weighs_environments_alike() -> None:
+    assert mean_score([np.array([1.0, 3.0]), np.array([8.0])]) == 5.0
 
 
 @pytest.mark.skipif(find_spec("rliable") is None, reason="needs the zoo extra")

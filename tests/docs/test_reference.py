@@ -85,12 +85,11 @@ def test_migration_tables_name_every_argument(other):
     assert all(table[f"`{name}`"] == f"`{name}`" for name in same_name)
 
 
-def test_every_documented_argument_exists():
-    assert {"n_steps", "target_kl"} <= set(inspect.signature(CRPN).parameters)
-    arguments = set(inspect.signature(ACRPN).parameters) | set(inspect.signature(CRPN).parameters)
+def test_tuning_names_arguments_that_exist():
     last_column = " ".join(row[2] for row in rows(page("tuning.md"), ".*") if len(row) == 3)
-    named = set(re.findall(r"`(\w+)(?:=[^`]*)?`", last_column))
-    assert named - arguments == set()
+    named = set(re.findall(r"`(\w+)(?:=[^`]*)?`", last_column)) - {"VecNormalize"}
+    assert "target_kl" in named
+    assert named <= set(inspect.signature(CRPN).parameters)
 
 
 # The modules whose ``__all__`` is public; of the others, the API page names what is

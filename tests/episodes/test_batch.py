@@ -11,7 +11,6 @@ from sb3_crpn.episodes.batch import (
     concatenate,
     episode_starts,
     episode_time,
-    map_observations,
     round_robin_split,
 )
 
@@ -158,12 +157,6 @@ def test_nothing_has_no_pieces():
     assert nothing.n_episodes == nothing.n_steps == 0
     assert nothing.chunks(None) == nothing.chunks(3) == []
     assert episode_scan(nothing.cost_advantages, 0.5, nothing.lengths, reverse=True).shape == (0,)
-
-
-def test_map_observations_reaches_every_key():
-    doubled = map_observations({"a": torch.ones(2)}, lambda tensor: 2.0 * tensor)
-    assert doubled["a"].tolist() == [2.0, 2.0]
-    assert map_observations(torch.ones(1), torch.neg).tolist() == [-1.0]
 
 
 @pytest.mark.parametrize("is_dict", [False, True])

@@ -1,0 +1,132 @@
+"""CRPN with H from other episodes than the update's, or as much of it as other episodes confirm."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+
+import torch
+from gymnasium import Env
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor
+
+from benchmarks.experiments.crossfit import CrossFit, Fold
+from benchmarks.experiments.steps import step_of_kl
+from sb3_crpn import CRPN
+from sb3_crpn.curvature import HESSIAN_ESTIMATORS, CurvatureEstimate, estimate_curvature
+from sb3_crpn.episodes import EpisodeBatch
+
+MAX_ORACLE_ENVS = 16
+# ω from which the held-out value chooses
+OMEGAS = (0.0, 0.25, 0.5, 0.75, 1.0)
+MEMORY = 0.9  # by which the values of the past fade in an update
+
+
+class FreshHessian(CRPN):
+    """H from the fresh rollout alone, g from the earlier ones too."""
+
+    def _estimate(
+        self, batch: EpisodeBatch, joined: EpisodeBatch, earlier: list[EpisodeBatch]
+    ) -> CurvatureEstimate:
+        return estimate_curvature(
+            self.policy,
+            self.actor,
+            joined,
+            HESSIAN_ESTIMATORS.resolve(self.hessian_estimator, self),
+            hessian_batch=self._hessian_batch(batch),
+            fisher_batch=batch,
+        )
+
+    def _hessian_batch(self, batch: EpisodeBatch) -> EpisodeBatch:
+        return batch
+
+
+class OracleHessian(FreshHessian):
+    """H from ``factor`` times as many fresh, independent episodes as the rollout has.
+
+    They are simulated in environments of their own, and counted nowhere: what a better estimate of
+    H would be worth, not a method. For environments without ``VecNormalize``.
+
+    Attributes
+    ----------
+    factor
+        The factor.
+    env_id
+        The environment's registered name, or a function that makes it.
+    """
+
+    factor: int
+    env_id: str | Callable[[], Env[Any, Any]]
+
+    @cached_property
+    def _oracle_env(self) -> VecEnv:
+        return make_vec_env(self.env_id, MAX_ORACLE_ENVS, seed=1000 + (self.seed or 0))
+
+    def _hessian_batch(self, batch: EpisodeBatch) -> EpisodeBatch:
+        n_episodes = self.factor * batch.n_episodes
+        return self._episode_batch(self._collect_evaluation_episodes(n_episodes, self._oracle_env))
+
+
+class ConfirmedHessian(CRPN):
+    """ω, and whether earlier rollouts join H, by the step's value on episodes that did not make it.
+
+    The value of a choice is the mean over folds of -(g·s + ½ sᵀHs), g and H the fold's, s made from
+    all other episodes with that choice and ``target_kl``; and over updates, the past fading.
+
+    Attributes
+    ----------
+    values
+        The mean values so far, by (source, ω).
+    choice
+        The (source, ω) of the last update.
+    """
+
+    def _setup_model(self) -> None:
+        self.values: dict[tuple[str, float], float] = {}
+        self.choice = ("all", 0.0)
+        super()._setup_model()
+
+    def _estimate(
+        self, batch: EpisodeBatch, joined: EpisodeBatch, earlier: list[EpisodeBatch]
+    ) -> CurvatureEstimate:
+        if batch.n_episodes > 1:
+            self._judge(CrossFit(self, batch, earlier))
+            self.choice = max(self.values, key=self.values.__getitem__)
+        source, self.hessian_shrinkage = self.choice
+        return estimate_curvature(
+            self.policy,
+            self.actor,
+            joined,
+            HESSIAN_ESTIMATORS.resolve(self.hessian_estimator, self),
+            hessian_batch=None if source == "all" else batch,
+            fisher_batch=batch,
+        )
+
+    def _judge(self, folds: CrossFit) -> None:
+        """Let this rollout's values fade into the means."""
+        total: dict[tuple[str, float], float] = {}
+        for fold in folds:
+            for choice, value in self._fold_values(folds, fold).items():
+                total[choice] = total.get(choice, 0.0) + fold.weight * value
+        for choice, value in total.items():
+            past = self.values.get(choice, value)
+            self.values[choice] = MEMORY * past + (1.0 - MEMORY) * value
+
+    def _fold_values(self, folds: CrossFit, fold: Fold) -> dict[tuple[str, float], float]:
+        assert self.target_kl is not None
+        forms, k = folds.hessian_forms(fold), fold.index
+        test = forms[k] / folds.sizes[k]
+        values = {}
+        for source, omega in itertools.product(("all", "fresh"), OMEGAS):
+            groups = slice(None) if source == "all" else slice(folds.n_folds)
+            rest = (forms[groups].sum(0) - forms[k]) / (folds.sizes[groups].sum() - folds.sizes[k])
+            y = step_of_kl(fold.gradient, omega * rest, fold.space, self.target_kl)
+            values[source, omega] = _gain(fold.test_gradient, test, y)
+        return values
+
+
+def _gain(gradient: Tensor, hessian: Tensor, y: Tensor) -> float:
+    return -float(gradient @ y + 0.5 * torch.dot(y, hessian @ y))

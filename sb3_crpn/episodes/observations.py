@@ -1,0 +1,59 @@
+"""Batches and single observations, arrays or dicts of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+
+from sb3_crpn.arrays import Observations
+
+
+def all_finite(value: Any) -> bool:
+    """Tell whether an array, or each one of a dict, is free of NaN and infinity."""
+    arrays = value.values() if isinstance(value, dict) else (value,)
+    return all(
+        np.isfinite(array).all() for array in arrays if np.issubdtype(array.dtype, np.floating)
+    )
+
+
+def as_observation(space: spaces.Space[Any], observation: Any) -> Any:
+    """Return one observation as an array of the space's shape and dtype, or a dict of them.
+
+    Environments may return Python numbers, lists, or dicts of such.
+    """
+    if isinstance(space, spaces.Dict):
+        return {
+            key: as_observation(subspace, observation[key])
+            for key, subspace in space.spaces.items()
+        }
+    return np.asarray(observation, dtype=space.dtype).reshape(space.shape or ())
+
+
+def as_arrays(observations: Any) -> Any:
+    """Return a batch of observations as an array, or a dict of arrays."""
+    if isinstance(observations, dict):
+        return {key: np.asarray(array) for key, array in observations.items()}
+    return np.asarray(observations)
+
+
+def stack_observations(observations: list[Any]) -> Any:
+    """Lay single observations of equal shapes, arrays or dicts of them, along a first axis."""
+    if isinstance(observations[0], dict):
+        return {
+            key: np.stack([observation[key] for observation in observations])
+            for key in observations[0]
+        }
+    return np.stack(observations)
+
+
+def map_observations(
+    observations: Observations, function: Callable[[torch.Tensor], torch.Tensor]
+) -> Observations:
+    """Apply ``function`` to the observation tensor, or to each one of a dict."""
+    if isinstance(observations, dict):
+        return {key: function(tensor) for key, tensor in observations.items()}
+    return function(observations)
