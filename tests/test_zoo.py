@@ -214,3 +214,26 @@ def test_unknown_scripts_are_named(capsys):
         main(["fly"])
     assert stop.value.code == 2
     assert "plot_from_file" in capsys.readouterr().err
+
+
+TIMESTEPS = f"""
+{ENV}:
+  n_envs: 3
+  n_timesteps: 300
+  policy: MlpPolicy
+  normalize: true
+  gamma: 0.9
+  rollout: timesteps
+  n_steps: 50
+"""
+
+
+def test_an_entry_may_ask_for_timesteps(tmp_path):
+    (tmp_path / "timesteps.yml").write_text(TIMESTEPS)
+    line = f"train --algo crpn --env {ENV} -conf timesteps.yml --eval-freq -1 --device cpu"
+    run([sys.executable, "-c", CHAIN, line], tmp_path)
+    model = load("crpn", tmp_path / f"logs/crpn/{ENV}_1")
+    assert model.rollout == "timesteps"
+    # two updates of 150 timesteps; no episode of 200 has ended in the first one
+    assert model.num_timesteps == 300
+    assert model._n_updates == 2
