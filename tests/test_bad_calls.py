@@ -14,6 +14,7 @@ from sb3_crpn.cubic import (
     cubic_finalsolver,
     cubic_subsolver,
     krylov_basis,
+    leftmost_eigenvalues,
     solve_dense,
     solve_krylov,
 )
@@ -72,6 +73,7 @@ CALLS = {
     cubic_subsolver: SOLVER,
     cubic_finalsolver: SOLVER,
     krylov_basis: {"matvec": _hvp, "start": THETA, "dim": 2},
+    leftmost_eigenvalues: {"matvec": _hvp, "like": THETA},
     ScoreBounds: {"G": 1.0, "L_1": 1.0, "L_2": 1.0},
     Constants: {"K": 1.0, "scores": SCORES, "H": 3, "d": 2},
     softmax_linear: {"feature_norm": 1.0},
@@ -96,7 +98,7 @@ CALLS = {
     RandomIterateCallback: {},
     CRPN.estimate_curvature: {"n_episodes": 2},
 }
-OPTIONS = ("confidence", "interval", "bounds", "n_eigenvalues", "n_probes")
+OPTIONS = ("confidence", "interval", "bounds", "n_eigenvalues", "n_probes", "progress_bar")
 # Words, whatever they are, are paths; environments are SB3's to judge
 FREE = {"self", "env", "tensorboard_log", "save_path"}
 

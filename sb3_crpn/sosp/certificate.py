@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, get_args
 
 import numpy as np
@@ -158,11 +159,9 @@ def certify_sosp(
         actor = _actor(policy, batch)
         sample = BatchMeans.from_episodes(policy, actor, batch, n_blocks, model.gamma, rng)
         spectrum, *intervals = _infer(sample, n_episodes, rng, options)
+        scales = partial(TaskScales.from_episodes, policy, actor, batch)
         thresholds = choose_thresholds(
-            options["epsilon"],
-            options["rho"],
-            paper_alpha(model),
-            lambda: TaskScales.from_episodes(policy, actor, batch),
+            options["epsilon"], options["rho"], paper_alpha(model), scales
         )
     gradient = sample.gradients.mean(0)
     return SospReport(
