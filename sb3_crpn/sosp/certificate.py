@@ -158,14 +158,15 @@ def certify_sosp(
         batch = _simulate(model, policy, target, n_episodes, options)
         actor = _actor(policy, batch)
         sample = BatchMeans.from_episodes(policy, actor, batch, n_blocks, model.gamma, rng)
-        spectrum, *intervals = _infer(sample, n_episodes, rng, options)
+        spectrum, norm, curvature = _infer(sample, n_episodes, rng, options)
         scales = partial(TaskScales.from_episodes, policy, actor, batch)
         thresholds = choose_thresholds(
             options["epsilon"], options["rho"], paper_alpha(model), scales
         )
     gradient = sample.gradients.mean(0)
     return SospReport(
-        *intervals,
+        norm,
+        curvature,
         epsilon=thresholds.epsilon,
         rho=thresholds.rho,
         thresholds=thresholds.origin,
