@@ -25,8 +25,7 @@ from sb3_crpn.checks import (
     pair,
     real,
 )
-from sb3_crpn.episodes.batch import EpisodeBatch
-from sb3_crpn.episodes.observations import map_observations
+from sb3_crpn.episodes.batch import EpisodeBatch, map_observations
 from sb3_crpn.parameters import ActorParameters
 from sb3_crpn.policy import find_actor
 from sb3_crpn.progress import load_bar, progress
@@ -56,7 +55,6 @@ _CHECKS: dict[str, Check] = {
 }
 
 
-@torch.enable_grad()
 def certify_sosp(
     model: OnPolicyAlgorithm,
     n_episodes: int,
@@ -158,15 +156,14 @@ def certify_sosp(
         batch = _simulate(model, policy, target, n_episodes, options)
         actor = _actor(policy, batch)
         sample = BatchMeans.from_episodes(policy, actor, batch, n_blocks, model.gamma, rng)
-        spectrum, norm, curvature = _infer(sample, n_episodes, rng, options)
+        spectrum, intervals = _infer(sample, n_episodes, rng, options)
         scales = partial(TaskScales.from_episodes, policy, actor, batch)
         thresholds = choose_thresholds(
             options["epsilon"], options["rho"], paper_alpha(model), scales
         )
     gradient = sample.gradients.mean(0)
     return SospReport(
-        norm,
-        curvature,
+        *intervals,
         epsilon=thresholds.epsilon,
         rho=thresholds.rho,
         thresholds=thresholds.origin,
@@ -201,7 +198,7 @@ def _simulate(
 
 def _infer(
     sample: BatchMeans, n_episodes: int, rng: np.random.Generator, options: dict[str, Any]
-) -> tuple[Spectrum, Interval, Interval]:
+) -> tuple[Spectrum, tuple[Interval, Interval]]:
     """Return the spectrum of Ĥ and the intervals of ‖∇J‖ and λ_min(∇²J)."""
     confidence, bounds = options["confidence"], options["bounds"]
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
@@ -218,7 +215,7 @@ def _infer(
             intervals = bootstrap_intervals(sample, spectrum, confidence, generator, rng)
         else:  # of "bernstein", by checked_options
             intervals = bernstein_intervals(sample, spectrum, confidence, bounds, n_episodes)
-    return spectrum, *intervals
+    return spectrum, intervals
 
 
 def _actor(policy: ActorCriticPolicy, batch: EpisodeBatch) -> ActorParameters:
