@@ -25,7 +25,8 @@ from sb3_crpn.checks import (
     pair,
     real,
 )
-from sb3_crpn.episodes.batch import EpisodeBatch, map_observations
+from sb3_crpn.episodes.batch import EpisodeBatch
+from sb3_crpn.episodes.observations import map_observations
 from sb3_crpn.parameters import ActorParameters
 from sb3_crpn.policy import find_actor
 from sb3_crpn.progress import load_bar, progress
