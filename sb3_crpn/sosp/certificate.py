@@ -56,6 +56,7 @@ _CHECKS: dict[str, Check] = {
 }
 
 
+@torch.enable_grad()
 def certify_sosp(
     model: OnPolicyAlgorithm,
     n_episodes: int,
