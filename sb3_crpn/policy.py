@@ -78,6 +78,11 @@ def sample_actions(policy: ActorCriticPolicy, observations: Observations) -> Arr
     return actions.cpu().numpy().reshape(-1, *(policy.action_space.shape or ()))
 
 
+def draw_noise(policy: ActorCriticPolicy, n_envs: int) -> None:
+    """Draw gSDE's noise anew, a matrix for each environment."""
+    policy.reset_noise(n_envs)
+
+
 def environment_actions(policy: ActorCriticPolicy, actions: Array) -> Array:
     """Return sampled actions as the environment takes them: in the bounds of its space."""
     space = policy.action_space

@@ -55,9 +55,8 @@ class GymnasiumVecEnv(VecEnv):
     env
         The vector environment, possibly wrapped, with ``metadata["autoreset_mode"]``.
     reset_mask
-        Whether a third-party environment in ``NEXT_STEP`` mode honours
-        ``options["reset_mask"]``: it resets those environments, leaves the others as they are,
-        and takes a true step of all of them next.
+        Whether a third-party environment in ``NEXT_STEP`` mode honours ``options["reset_mask"]``:
+        it resets those environments alone, and takes a true step of all of them next.
     """
 
     def __init__(self, env: AnyVectorEnv, *, reset_mask: bool = False):

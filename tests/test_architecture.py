@@ -160,3 +160,8 @@ def test_functions_are_short(path):
         if function.name not in ("__init__", "__post_init__")
     ]
     assert [entry for entry in lengths if entry[-1] > MAX_FUNCTION_LINES] == []
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_files_are_short(path):
+    assert len(path.read_text().splitlines()) <= 300

@@ -210,10 +210,7 @@ class EpisodeBatch:
         return sum(gather_counts(self.size))
 
     def folds(self, n_folds: int) -> list[IntArray]:
-        """Split the trajectories of all ranks into at most ``n_folds``; return this rank's part.
-
-        See :func:`round_robin_split`; every rank must ask.
-        """
+        """Return this rank's part of at most ``n_folds`` :func:`round_robin_split` folds."""
         counts = gather_counts(self.n_trajectories)
         n_folds = max(1, min(n_folds, sum(counts)))
         return round_robin_split(self.trajectories, n_folds, first=sum(counts[: rank()]))

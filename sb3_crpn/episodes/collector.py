@@ -19,7 +19,7 @@ from sb3_crpn.episodes.buffer import EpisodeRolloutBuffer
 from sb3_crpn.episodes.observations import all_finite, as_arrays, as_observation
 from sb3_crpn.episodes.running_moments import RunningMoments
 from sb3_crpn.episodes.tracker import RolloutSize, Segment, Tracker
-from sb3_crpn.policy import environment_actions, sample_actions, to_tensor
+from sb3_crpn.policy import draw_noise, environment_actions, sample_actions, to_tensor
 
 # An environment is taken to be endless when no episode ends within so many steps: nearly twice
 # the longest episode in common use (Atari's 108,000 frames at a frame skip of 4).
@@ -179,7 +179,7 @@ class Collector:
             return
         frequency = self._sde_sample_freq
         if self._n_steps == 0 or (frequency > 0 and self._n_steps % frequency == 0):
-            self.policy.reset_noise(self.env.num_envs)
+            draw_noise(self.policy, self.env.num_envs)
 
     def _step(self) -> Transition:
         """Take one step in every environment; what ``VecNormalize`` learns of NaN is undone."""

@@ -44,7 +44,6 @@ class _Plan(NamedTuple):
 # (5/2)t + c_2 = 1 makes (3) hold, and c_1 = 2A/(3t), A = (7/12)t³ - ½c_2t², makes N·m least
 _EXACT = _Plan(3 / 64, 1 / 16, 9 / 1024)
 _LONGEST_SOSP_STEP = 3 / 8
-
 _APPROXIMATE = _Plan(1 / 150, 1 / 200, 1 / 320)
 # The least ℓ/√(ρε): a smaller one would make the perturbation too large
 _LEAST_CONDITION = 150.0
@@ -282,8 +281,7 @@ def _checked(
 
 def _allowed_errors(constants: Constants, epsilon: float, plan: _Plan) -> tuple[float, float]:
     """Return c_1 ε and c_2 √(L_H ε)."""
-    curvature = math.sqrt(constants.L_H * epsilon)
-    return plan.gradient_error * epsilon, plan.hessian_error * curvature
+    return plan.gradient_error * epsilon, plan.hessian_error * math.sqrt(constants.L_H * epsilon)
 
 
 def _bernstein(
