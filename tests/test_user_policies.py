@@ -8,6 +8,7 @@ import pytest
 import torch
 from gymnasium import spaces
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import kl_divergence
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -327,3 +328,38 @@ def test_dictionaries_of_observations_find_the_same_actor():
     model.learn(40)
     model.policy.action_net.requires_grad_(False)
     assert [id(t) for t in model.actor.tensors] == before[:-2]
+
+
+class Hook(BaseCallback):
+    """Does something once, at the 20th step."""
+
+    def __init__(self, action):
+        super().__init__()
+        self.action = action
+
+    def _on_step(self):
+        if self.n_calls == 20:
+            self.action(self.model)
+        return True
+
+
+@both
+@pytest.mark.parametrize("rollout", ["episodes", "timesteps"])
+def test_a_copy_made_in_mid_rollout_learns(algorithm, rollout):
+    copies = []
+    model = make(algorithm, several(2), rollout=rollout)
+    model.learn(96, Hook(lambda model: copies.append(copy.deepcopy(model))))
+    (copied,) = copies
+    theta = copied.actor.vector
+    copied.set_env(several(2))
+    copied.learn(96)
+    assert not torch.equal(copied.actor.vector, theta)
+
+
+@pytest.mark.parametrize("rollout", ["episodes", "timesteps"])
+def test_an_environment_set_in_mid_rollout_is_reset_before_its_first_step(rollout):
+    other = several(2)
+    model = make(CRPN, several(2), rollout=rollout)
+    model.learn(96, Hook(lambda model: model.set_env(other)))
+    model.learn(96, reset_num_timesteps=False)
+    assert [env.resets > 0 for env in other.envs] == [True, True]

@@ -44,6 +44,11 @@ class RolloutAlgorithm(OnPolicyAlgorithm, PolicyNewtonSettings):
     _mean_reward = 0.0  # of the last rollout, in the environment's own units
     _trajectory_times: IntArray | None = None  # where the training environments stand
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Let a copy that is made in mid-rollout be in none: its environments are reset first."""
+        in_rollout = {"_collecting": False, "_interrupted": True} if self._collecting else {}
+        return vars(self) | in_rollout
+
     def _scheduled_episodes(self) -> tuple[int | None, int | None]:
         """Return m_k and b_k of this update, ``None`` where they follow from ``n_steps``."""
         raise NotImplementedError
@@ -157,18 +162,16 @@ class RolloutAlgorithm(OnPolicyAlgorithm, PolicyNewtonSettings):
             self._update_info_buffer(transition.infos, transition.dones)
             return True
 
-        with self._in_rollout(env):
+        with _Rollout(self, env):
             try:
                 completed = collector.collect(buffer, self.tracker, size, on_step)
             finally:
                 self.num_timesteps = collector.timestep
-                self._leave(collector)
+                if env is self.env:  # a callback may have set another
+                    self._leave(collector)
             self._interrupted = not completed
             self._mean_reward = collector.mean_reward
         return completed
-
-    def _in_rollout(self, env: VecEnv) -> _Rollout:
-        return _Rollout(self, env)
 
     def _collector(self, env: VecEnv) -> Collector:
         """Return a collector that goes on where the training environments stand."""
@@ -219,7 +222,7 @@ class RolloutAlgorithm(OnPolicyAlgorithm, PolicyNewtonSettings):
         buffer = self._new_buffer(target.num_envs)
         normalizer = unwrap_vec_normalize(target)
         learns = normalizer is not None and normalizer.training
-        with self._in_rollout(target):
+        with _Rollout(self, target):
             try:
                 if normalizer is not None:
                     normalizer.training = False

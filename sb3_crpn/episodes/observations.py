@@ -30,7 +30,10 @@ def as_observation(space: spaces.Space[Any], observation: Any) -> Any:
             key: as_observation(subspace, observation[key])
             for key, subspace in space.spaces.items()
         }
-    return np.asarray(observation, dtype=space.dtype).reshape(space.shape or ())
+    array, shape = np.asarray(observation, dtype=space.dtype), space.shape or ()
+    if array.size != np.prod(shape):
+        raise ValueError(f"the environment returned an observation of {array.shape}, not {shape}")
+    return array.reshape(shape)
 
 
 def as_arrays(observations: Any) -> Any:

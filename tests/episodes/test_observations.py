@@ -30,6 +30,11 @@ def test_single_observations_become_arrays_of_the_space(space, observation, expe
     np.testing.assert_array_equal(nested["x"], expected)
 
 
+def test_a_wrong_shape_is_said():
+    with pytest.raises(ValueError, match=r"returned an observation of \(5,\), not \(3,\)"):
+        as_observation(spaces.Box(-1.0, 1.0, (3,)), np.zeros(5))
+
+
 def test_finite_means_every_key():
     bad = np.array([0.0, np.nan])
     assert all_finite(np.arange(2))
