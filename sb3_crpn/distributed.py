@@ -166,7 +166,7 @@ def mean_and_variance(values: FloatArray) -> tuple[float, float]:
 
 
 def local_count(number: int) -> int:
-    """Return this rank's part of ``number`` things that are dealt out evenly."""
+    """Return this rank's part of ``number`` things that are spread evenly."""
     return number // world_size() + (rank() < number % world_size())
 
 

@@ -32,7 +32,7 @@ MAX_FORM_COLUMNS = 128
 
 
 class EpisodeFolds:
-    """The episodes of all ranks, dealt in turn to K folds, of which this rank holds a part.
+    """The trajectories of all ranks, split round-robin into K folds; this rank holds a part.
 
     K = 2, or 1 where there is only one episode.
 

@@ -221,7 +221,7 @@ class EpisodeBatch:
         return world_size() == 1
 
     def share(self, n_episodes: int) -> int:
-        """Return this rank's share of ``n_episodes`` that are dealt out evenly."""
+        """Return this rank's share of ``n_episodes`` that are spread evenly."""
         return local_count(n_episodes)
 
     def total(self, part: torch.Tensor) -> torch.Tensor:
