@@ -24,10 +24,14 @@ LAMBDA_MIN = -1.5  # at the saddle of the coordination MDP
 FISHER = 1.5
 
 
-def tabular(mdp, theta, algorithm=PPO, **arguments):
-    """A model whose policy is softmax-linear with the given parameters."""
+def tabular(mdp, theta, algorithm=PPO, n_envs=1, **arguments):
+    """A model whose policy is softmax-linear with the given parameters.
+
+    A step of many environments takes hardly longer than one's: where there are many episodes.
+    """
+    env = DummyVecEnv([lambda: TabularEnv(mdp)] * n_envs)
     options = {"gamma": mdp.gamma, "policy_kwargs": {"net_arch": []}, "seed": 0, **arguments}
-    model = algorithm("MlpPolicy", TabularEnv(mdp), device="cpu", **options)
+    model = algorithm("MlpPolicy", env, device="cpu", **options)
     assign_actor(model.policy, theta)
     return model
 
@@ -52,7 +56,7 @@ def optimised(mdp, n_steps=300):
 
 @pytest.mark.parametrize("algorithm", [PPO, A2C, TRPO, CRPN, ACRPN])
 def test_a_strict_saddle_is_told_from_its_episodes(algorithm):
-    report = certify_sosp(saddle(algorithm), 400, epsilon=0.5, rho=1.0, seed=0)
+    report = certify_sosp(saddle(algorithm, n_envs=20), 400, epsilon=0.5, rho=1.0, seed=0)
     assert isinstance(report, SospReport)
     assert report.verdict == "saddle"
     assert report.gradient_norm.lower == pytest.approx(0.0, abs=0.2)
@@ -64,7 +68,7 @@ def test_a_strict_saddle_is_told_from_its_episodes(algorithm):
 
 def test_the_escape_direction_lowers_the_cost():
     mdp = coordination_mdp()
-    direction = certify_sosp(saddle(), 200, epsilon=0.5, rho=1.0, seed=0).escape_direction
+    direction = certify_sosp(saddle(n_envs=20), 200, epsilon=0.5, rho=1.0, seed=0).escape_direction
     assert direction.norm() == pytest.approx(1.0)
     assert direction @ mdp.hessian(SADDLE) @ direction < 0.9 * LAMBDA_MIN
     assert mdp.cost(SADDLE + 0.5 * direction) < mdp.cost(SADDLE) - 0.1
@@ -84,7 +88,7 @@ def test_a_steep_policy_is_not_stationary():
         mdp.n_parameters, dtype=torch.float64, generator=torch.Generator().manual_seed(5)
     )
     norm = mdp.gradient(theta).norm().item()
-    report = certify_sosp(tabular(mdp, theta), 1000, epsilon=0.3 * norm, rho=1.0, seed=0)
+    report = certify_sosp(tabular(mdp, theta, n_envs=50), 1000, epsilon=0.3 * norm, rho=1.0, seed=0)
     assert report.verdict == "not stationary"
     assert report.gradient_norm.lower <= norm <= report.gradient_norm.upper
 
@@ -92,7 +96,7 @@ def test_a_steep_policy_is_not_stationary():
 def test_an_optimised_policy_is_an_sosp():
     mdp = blind()
     theta = optimised(mdp)
-    report = certify_sosp(tabular(mdp, theta), 1000, epsilon=0.5, rho=1.0, seed=0)
+    report = certify_sosp(tabular(mdp, theta, n_envs=100), 2000, epsilon=0.5, rho=1.0, seed=0)
     assert mdp.is_sosp(theta, 0.5, 1.0)
     assert report.verdict == "sosp"
 
@@ -106,7 +110,7 @@ def test_estimates_are_unbiased_for_a_biased_training_configuration(theta):
     """Mean over certificates against the exact derivatives."""
     mdp = random_mdp(2)
     theta = theta.new_tensor(np.resize(theta.numpy(), mdp.n_parameters))
-    model = tabular(mdp, theta, CRPN, gae_lambda=0.5, hessian_lambda=0.0)
+    model = tabular(mdp, theta, CRPN, n_envs=5, gae_lambda=0.5, hessian_lambda=0.0)
     gradients = torch.stack(
         [certify_sosp(model, 20, epsilon=1.0, seed=seed).gradient for seed in range(20)]
     )
@@ -179,7 +183,7 @@ def test_thresholds_chosen_from_the_same_episodes_keep_the_confidence():
     for theta in ([1.0, -1.0, 0.0, 0.0, 0.0, 0.0], [0.5, 0.5, -0.5, -0.5, 0.0, 0.0]):
         theta = torch.tensor(theta, dtype=torch.float64)
         norm, lowest = mdp.gradient(theta).norm(), torch.linalg.eigvalsh(mdp.hessian(theta))[0]
-        model = tabular(mdp, theta)
+        model = tabular(mdp, theta, n_envs=10)
         model.get_env().seed(0)
         for seed in range(n):
             report = certify_sosp(model, 40, confidence=confidence, seed=seed)
@@ -205,7 +209,7 @@ def test_undecided_says_how_many_episodes_would_decide():
     assert few.verdict == "undecided"
     needed = few.episodes_to_decide
     assert f"about {needed:,} episodes would decide" in str(few)
-    many = certify_sosp(saddle(), 2 * needed, epsilon=0.3, rho=1.0, seed=0)
+    many = certify_sosp(saddle(n_envs=20), 2 * needed, epsilon=0.3, rho=1.0, seed=0)
     assert 40 < needed < 4000
     assert many.verdict == "saddle"
     assert many.episodes_to_decide is None
@@ -279,7 +283,7 @@ def test_the_same_seed_gives_the_same_certificate():
 
 def test_the_model_is_left_as_it_was():
     env = VecNormalize(DummyVecEnv([lambda: gym.make("CartPole-v1")]))
-    model = PPO("MlpPolicy", env, seed=0, device="cpu")
+    model = PPO("MlpPolicy", env, seed=0, device="cpu", n_steps=64)
     before = [p.clone() for p in model.policy.parameters()]
     state, mean = torch.get_rng_state(), model.env.obs_rms.mean.copy()
     model.policy.set_training_mode(True)
@@ -347,7 +351,7 @@ def test_an_endless_episode_is_an_error(monkeypatch):
 
 
 def test_the_report_reads_and_draws():
-    report = certify_sosp(saddle(), 400, epsilon=0.5, rho=1.0, seed=0)
+    report = certify_sosp(saddle(n_envs=20), 400, epsilon=0.5, rho=1.0, seed=0)
     text = str(report)
     assert text.startswith("saddle: ε = 0.5")
     assert "95% confidence (bootstrap)" in text
