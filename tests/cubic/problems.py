@@ -32,7 +32,7 @@ class Problem:
 
 
 class Counter:
-    """v ↦ Hv that keeps the vectors it was called with."""
+    """v ↦ Hv that records its arguments."""
 
     def __init__(self, hessian):
         self.hessian = hessian
@@ -171,7 +171,7 @@ def is_rejected(problem, result):
 
 
 def step_of(problem, s):
-    """A solver's claim that s is the minimiser."""
+    """A solver's claim that s is the global minimiser."""
     s = np.asarray(s, float)
     return CubicStep(
         step=torch.from_numpy(s),

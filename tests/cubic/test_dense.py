@@ -173,7 +173,7 @@ def test_bad_input(change, message):
         solve_dense(**arguments)
 
 
-# Mutants: the judge has to tell broken solvers from the right one.
+# Mutants: the judge has to detect broken solvers.
 
 
 def break_hard_case(monkeypatch):
@@ -215,7 +215,7 @@ def test_a_broken_solver_is_rejected(monkeypatch, mutate):
 
 
 def solve_claiming(problem):
-    """The step with every claim made, so that the judge and not the certificate has to see it."""
+    """The step with ``certified`` set, so that the judge has to detect the error."""
     return step_of(problem, solve(problem).step)
 
 

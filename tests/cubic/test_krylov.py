@@ -97,7 +97,7 @@ def test_easy_problems_are_cheap():
     assert solve(large(alpha=1e6)).products <= 20
     # two distinct eigenvalues: two-dimensional Krylov spaces
     assert solve(large(eigenvalues=np.repeat([-1.0, 2.0], 150))).products <= 2 + 2 + 1
-    # H = 0: one product shows that g is an eigenvector, one that the random start is
+    # H = 0: one product each shows that g and the random start are eigenvectors
     assert solve(spectral("", np.zeros(50), np.ones(50))).products == 3
 
 
@@ -236,7 +236,7 @@ def test_residual_is_known_without_a_product():
     assert point.residual == pytest.approx(float((H @ s + point.multiplier * s + g).norm()))
 
 
-# Mutants: the judge has to tell broken solvers from the right one.
+# Mutants: the judge has to detect broken solvers.
 
 
 def break_random_start(monkeypatch):
@@ -280,7 +280,7 @@ def test_a_broken_solver_is_rejected(monkeypatch, mutate):
 
 
 def test_a_solver_without_random_start_misses_the_hidden_direction(monkeypatch):
-    # diagonal, so that rounding does not show the direction either
+    # diagonal, so that rounding errors have no component along the direction
     problem = spectral("", SPECTRA["outlier"], np.r_[0, np.ones(299)])
     assert_global_minimiser(problem, solve(problem))
     break_random_start(monkeypatch)

@@ -44,7 +44,7 @@ def begun(n_episodes, at_episode_start, horizon=None):
 
 
 def run(tracker, dones):
-    """The segments that these steps end, as (env, start, length, cut)."""
+    """The segments that end with these steps, as (env, start, length, truncated)."""
     segments = [end for row in dones for end in tracker.advance(np.array(row, bool))]
     assert all(segment.time == 0 for segment in segments)
     return [(s.env, s.start, s.length, s.cut) for s in segments]
@@ -91,7 +91,7 @@ def test_an_environment_without_quota_is_ignored():
 
 
 class FirstToFinish(EpisodeTracker):
-    """The mistake: the first m episodes to finish, whichever environment they come from."""
+    """The biased selection: the first m episodes to finish of all environments."""
 
     def begin(self, size, times):
         super().begin(size, times)
@@ -110,7 +110,7 @@ class FirstToFinish(EpisodeTracker):
 
 
 def lengths_and_returns(n_repeats=150, n_episodes=12):
-    """Mean length and discounted return of the kept episodes, [n, 2], and the exact ones."""
+    """Mean length and discounted return of the valid episodes, [n, 2], and the exact ones."""
     mdp = random_mdp(2, horizon=12)
     model = tabular_crpn(mdp, n_envs=8)
     theta = random_parameters(mdp)
@@ -133,7 +133,7 @@ def test_kept_episodes_are_not_biased_towards_short_ones(monkeypatch):
 
 
 class Clock(gym.Env):
-    """Observes the time, is rewarded 1 a step, and terminates after given numbers of steps."""
+    """Observes the time, has the reward 1 a step, and terminates after given numbers of steps."""
 
     action_space = spaces.Discrete(2)
     observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float32)
@@ -156,7 +156,7 @@ class Clock(gym.Env):
 
 
 class Updates(BaseCallback):
-    """What the rollouts looked like."""
+    """Records of the rollouts."""
 
     def __init__(self):
         super().__init__()

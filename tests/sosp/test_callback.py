@@ -30,7 +30,7 @@ def certifying(env_id="CartPole-v1", **options):
     ("env_id", "options"), [("CartPole-v1", {}), ("Pendulum-v1", {"use_sde": True})]
 )
 def test_training_goes_on_as_without_it(algorithm, env_id, options):
-    """Bit for bit; on Pendulum with gSDE, whose noise lasts over many steps."""
+    """Training is bit-equal, on Pendulum with gSDE, whose noise lasts over many steps."""
     parameters = []
     for callback in (None, certifying(env_id)):
         model = model_of(algorithm, env_id, **options)

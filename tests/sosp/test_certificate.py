@@ -37,7 +37,7 @@ def saddle(algorithm=PPO, **arguments):
 
 
 def blind():
-    """An MDP whose best policy is random: states that look alike. The optimum lies inside."""
+    """An MDP with aliased states. Its optimal policy is stochastic, and the optimum is finite."""
     return random_mdp(26, n_states=4, n_observations=1, horizon=4, gamma=1.0)
 
 
@@ -164,7 +164,7 @@ def test_the_intervals_depend_on_no_threshold():
 
 
 def thresholds_of_an_adversary(report):
-    """Those that the intervals just decide, every verdict in turn: chosen from the same data."""
+    """Thresholds at the limits of the intervals, from the same data, for every verdict."""
     of_gradient, of_curvature = report.gradient_norm, report.lambda_min
     for epsilon in (0.999 * of_gradient.lower, of_gradient.upper, 2.0 * of_gradient.upper):
         for curvature in (of_curvature.lower, 0.999 * of_curvature.upper, -1e-3):
@@ -173,7 +173,7 @@ def thresholds_of_an_adversary(report):
 
 
 def test_thresholds_chosen_from_the_same_episodes_keep_the_confidence():
-    """Default and adversary's: wrong with probability 1 - confidence at most."""
+    """Default and adversarial thresholds: wrong with probability 1 - confidence at most."""
     mdp, n, confidence = coordination_mdp(), 12, 0.8
     wrong, decided = 0, set()
     for theta in ([1.0, -1.0, 0.0, 0.0, 0.0, 0.0], [0.5, 0.5, -0.5, -0.5, 0.0, 0.0]):

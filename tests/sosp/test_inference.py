@@ -48,7 +48,7 @@ HESSIANS = {
 @pytest.mark.parametrize("gradient", GRADIENTS)
 @pytest.mark.parametrize("hessian", HESSIANS)
 def test_the_intervals_cover(gradient, hessian):
-    """Two limits each fail in at most 2.5 % of samples; 15 of 200 would be one in 10,000."""
+    """Each of two limits fails in at most 2.5 % of samples. 15 of 200 has a probability of 1e-4."""
     g, H = GRADIENTS[gradient].double(), HESSIANS[hessian].double()
     norm, lambda_min = g.norm().item(), torch.linalg.eigvalsh(H)[0].item()
     misses = np.zeros(4)
@@ -92,7 +92,7 @@ def test_blocks_that_show_nothing_prove_nothing():
 
 
 def test_what_the_probabilities_imply_widens_the_intervals():
-    """Blocks that agree because none of them saw a rare action."""
+    """Blocks that agree, since none contains a rare action."""
     g, H = GRADIENTS["small"].double(), HESSIANS["saddle"].double()
     sample = noisy_sample(g, H, 0.1, 10, 0)
     widths, previous = [], None

@@ -111,5 +111,5 @@ def test_the_debiased_norm_is_free_of_the_bias_of_noise():
         squares.append(debiased_norm(sample) ** 2)
     assert sum(naive) / 400 > 5.0
     assert debiased_norm(truth.expand(4, -1)) == pytest.approx(1.0)
-    # negative squares are cut at 0, so that some bias is left
+    # negative squares are clipped at 0, which leaves some bias
     assert 0.5 < sum(squares) / 400 < 5.0

@@ -1,4 +1,4 @@
-"""docs/THEORY.md leads from every numbered statement to what implements and tests it."""
+"""docs/THEORY.md leads from every numbered statement to its code and its test."""
 
 import re
 from importlib import import_module
@@ -37,7 +37,7 @@ NAMES = sorted({name for cells in ROWS.values() for name in re.findall(r"`([^`]+
 
 
 def exists(name):
-    """Whether a file, a test "file::function" or a dotted name is there."""
+    """Return whether a file, a test "file::function" or a dotted name exists."""
     path, _, test = name.partition("::")
     if "/" in path:
         found = (ROOT / path).is_file()
