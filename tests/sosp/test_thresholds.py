@@ -62,7 +62,7 @@ def test_defaults_fill_in_what_is_not_given(given, expected):
 
 def test_slope_and_curvature_change_the_return_by_a_tenth_over_the_distance():
     chosen = choose_thresholds(None, None, None, lambda: SCALES)
-    s = SCALES.distance
+    s = SCALES.step_norm
     assert chosen.epsilon * s == pytest.approx(2.0)
     assert 0.5 * math.sqrt(chosen.rho * chosen.epsilon) * s**2 == pytest.approx(2.0)
 
