@@ -12,6 +12,8 @@ import sb3_crpn
 PACKAGE = Path(sb3_crpn.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_FUNCTION_LINES = 40
+# Layers in which each module has the test file of its name
+TESTED_BY_MODULE = {"cubic", "curvature", "episodes", "sosp", "theory"}
 
 # From bottom to top. A module imports from the layers before it only
 GROUND = {"checks", "arrays"}
@@ -166,3 +168,14 @@ def test_functions_are_short(path):
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_files_are_short(path):
     assert len(path.read_text().splitlines()) <= 300
+
+
+MIRRORED = [
+    path for path in FILES if layer_of(path) in TESTED_BY_MODULE and path.stem != "__init__"
+]
+
+
+@pytest.mark.parametrize("path", MIRRORED, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_every_module_has_its_test_file(path):
+    folder = Path(__file__).parent / path.relative_to(PACKAGE).parent
+    assert (folder / f"test_{path.stem.strip('_')}.py").is_file()

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from benchmarks.exact import TabularEnv, assign_actor
 from sb3_crpn import ACRPN, CRPN
 from sb3_crpn.sosp import SospCallback
-from tests.sosp.test_certificate import blind, optimised
+from tests.sosp.problems import blind, optimised
 
 ALGORITHMS = [PPO, A2C, TRPO, CRPN, ACRPN]
 

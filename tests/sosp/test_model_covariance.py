@@ -10,7 +10,7 @@ from sb3_crpn.sosp import certify_sosp
 from sb3_crpn.sosp import model_covariance as module
 from sb3_crpn.sosp.model_covariance import model_covariance
 from tests.policies import flat_gradient, frozen_episodes, small_policy
-from tests.sosp.test_certificate import tabular
+from tests.sosp.problems import tabular
 
 GAMMA = 0.9
 N_BLOCKS = 2
