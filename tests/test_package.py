@@ -1,4 +1,4 @@
-"""What is distributed: the source distribution tests itself, the wheel works by itself."""
+"""The distributions: the source distribution has its tests, the wheel runs without the sources."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Whole training runs, in TRPO's at equally many steps."""
+"""Whole training runs, relative to TRPO at as many steps."""
 
 from __future__ import annotations
 

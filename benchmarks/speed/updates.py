@@ -1,4 +1,4 @@
-"""One CRPN and one ACRPN update, in TRPO's: same data, same network, same critic work."""
+"""One CRPN and one ACRPN update, relative to TRPO: same data, network and critic work."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ WARM_UP_ROLLOUTS = 3
 
 SETTINGS: dict[str, dict[str, Any]] = {"one rollout": {"n_reused_rollouts": 0}, "defaults": {}}
 
-# What training changes besides networks and optimiser
+# State that training changes besides networks and optimiser
 _MUTABLE = (bool, int, float, type(None), Replay)
 
 
@@ -123,7 +123,7 @@ def _as_sb3(leader: PolicyNewtonAlgorithm, model: OnPolicyAlgorithm) -> RolloutB
 
 
 def update_task(model: OnPolicyAlgorithm, *, critic: bool) -> Task:
-    """Return ``model.train()`` from the state in which the model is now."""
+    """Return ``model.train()`` from the present state of the model."""
     policy = copy.deepcopy(model.policy.state_dict())
     optimizer = copy.deepcopy(model.policy.optimizer.state_dict())
     state = {name: value for name, value in vars(model).items() if isinstance(value, _MUTABLE)}

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from benchmarks.exact import TabularEnv, assign_actor
 from sb3_crpn import ACRPN, CRPN
 from sb3_crpn.sosp import SospCallback
-from tests.sosp.test_certificate import blind, optimised
+from tests.sosp.problems import blind, optimised
 
 ALGORITHMS = [PPO, A2C, TRPO, CRPN, ACRPN]
 
@@ -32,7 +32,7 @@ def certifying(env_id="CartPole-v1", **options):
     ("env_id", "options"), [("CartPole-v1", {}), ("Pendulum-v1", {"use_sde": True})]
 )
 def test_training_goes_on_as_without_it(algorithm, env_id, options):
-    """Bit for bit; on Pendulum with gSDE, whose noise lasts over many steps."""
+    """Training is bit-equal, on Pendulum with gSDE, whose noise lasts over many steps."""
     parameters = []
     for callback in (None, certifying(env_id)):
         model = model_of(algorithm, env_id, **options)
