@@ -30,7 +30,7 @@ from sb3_crpn.algorithm.solvers import SubproblemSolver
 from sb3_crpn.algorithm.statistics import UpdateStats
 from sb3_crpn.algorithm.step import take_step
 from sb3_crpn.algorithm.update import UpdateData, local_model, rollout_statistics, step_statistics
-from sb3_crpn.checks import COUNT, NONE, POSITIVE, not_allowed, requires
+from sb3_crpn.checks import COUNT, FLAG, NONE, POSITIVE, not_allowed, requires
 from sb3_crpn.curvature import HESSIAN_ESTIMATORS, CurvatureEstimate, estimate_curvature
 from sb3_crpn.episodes import (
     TRACKERS,
@@ -171,13 +171,7 @@ class PolicyNewtonAlgorithm(ResumableAlgorithm, PolicyNewtonSettings):
         rollout_buffer: RolloutBuffer,
         n_rollout_steps: int,
     ) -> bool:
-        """Fill the buffer with the tracker's segments; return False if a callback asked to stop.
-
-        Raises
-        ------
-        ValueError
-            A reward or an observation is not finite, or no episode comes to an end.
-        """
+        """Fill the buffer with the tracker's segments; return False if a callback asked to stop."""
         assert isinstance(rollout_buffer, EpisodeRolloutBuffer)  # set by _setup_model
         return self.rollouts.collect(self, env, callback, rollout_buffer, n_rollout_steps)
 
@@ -216,7 +210,9 @@ class PolicyNewtonAlgorithm(ResumableAlgorithm, PolicyNewtonSettings):
             self.last_update.write(self.logger)
 
     @torch.enable_grad()
-    def estimate_curvature(self, n_episodes: int, env: VecEnv | None = None) -> CurvatureEstimate:
+    def estimate_curvature(
+        self, n_episodes: int, env: VecEnv | None = None, *, progress_bar: bool = False
+    ) -> CurvatureEstimate:
         """Estimate gradient and Hessian of J at the current policy from fresh episodes.
 
         The estimators are those of the constructor's arguments; nothing is learnt, and the
@@ -228,11 +224,15 @@ class PolicyNewtonAlgorithm(ResumableAlgorithm, PolicyNewtonSettings):
             Number of episodes, used for the gradient and for the Hessian alike.
         env
             Where to simulate; ``None``: the training environment.
+        progress_bar
+            Show the episodes simulated, on each rank its own; needs tqdm and rich.
         """
         n_episodes = COUNT("estimate_curvature: n_episodes", n_episodes)
         env = (_VEC_ENV | NONE)("estimate_curvature: env", env)
+        show = FLAG("estimate_curvature: progress_bar", progress_bar)
         share_policy(self.policy)
-        return self._estimate_from(self._batch(self.rollouts.evaluate(self, n_episodes, env)))
+        buffer = self.rollouts.evaluate(self, n_episodes, env, show=show)
+        return self._estimate_from(self._batch(buffer))
 
     def _data(self) -> UpdateData:
         """Return the episodes of this update, each rollout as the present policy sees it."""

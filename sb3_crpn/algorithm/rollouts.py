@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_crpn.algorithm.settings import checked_schedule
 from sb3_crpn.arrays import IntArray
@@ -21,11 +21,13 @@ from sb3_crpn.distributed import local_count, world_size
 from sb3_crpn.episodes import (
     Collector,
     EpisodeRolloutBuffer,
-    EpisodeTracker,
     RolloutSize,
+    TickingTracker,
     Transition,
     steps_to_quota,
 )
+from sb3_crpn.episodes.running_moments import frozen_moments
+from sb3_crpn.progress import progress
 
 if TYPE_CHECKING:
     from sb3_crpn.algorithm.algorithm import PolicyNewtonAlgorithm
@@ -164,12 +166,17 @@ class TrainingRollouts:
         return completed
 
     def evaluate(
-        self, model: PolicyNewtonAlgorithm, n_episodes: int, env: VecEnv | None
+        self,
+        model: PolicyNewtonAlgorithm,
+        n_episodes: int,
+        env: VecEnv | None,
+        *,
+        show: bool = False,
     ) -> EpisodeRolloutBuffer:
         """Simulate whole episodes outside training: no callbacks, no timesteps counted.
 
         ``env=None`` is the training environment, which the next rollout finds as if a rollout of
-        its own had come before.
+        its own had come before. ``show``: with a progress bar.
         """
         target = model.env if env is None else env
         if target is None:
@@ -177,18 +184,12 @@ class TrainingRollouts:
         buffer = copy(model.rollout_buffer)
         assert isinstance(buffer, EpisodeRolloutBuffer)  # by the checks of arguments
         buffer.n_envs = target.num_envs
-        normalizer = unwrap_vec_normalize(target)
-        learns = normalizer is not None and normalizer.training
-        with self._occupying(model, target):
-            try:
-                if normalizer is not None:
-                    normalizer.training = False
+        size = _share(RolloutSize(model.n_steps, n_episodes, model.horizon))
+        bar = progress("episodes", size.n_episodes, show=show)
+        with bar as tick, self._occupying(model, target):
+            with frozen_moments(target):
                 collector = self._collector(model, target)
-                size = RolloutSize(model.n_steps, n_episodes, model.horizon)
-                collector.collect(buffer, EpisodeTracker(), _share(size))
-            finally:
-                if normalizer is not None:
-                    normalizer.training = learns
+                collector.collect(buffer, TickingTracker(tick), size)
             if target is model.env:
                 self._leave(model, collector)
                 self.interrupted = False

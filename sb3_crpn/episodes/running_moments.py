@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, TypeAlias
 
 from stable_baselines3.common.running_mean_std import RunningMeanStd
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_crpn.arrays import FloatArray
 
@@ -56,3 +58,17 @@ class RunningMoments:
         self.write(moments)
         if self._normalizer is not None and returns is not None:
             self._normalizer.returns = returns
+
+
+@contextmanager
+def frozen_moments(env: VecEnv) -> Iterator[None]:
+    """Let a ``VecNormalize`` around the environments learn nothing from the block's steps."""
+    normalizer = unwrap_vec_normalize(env)
+    if normalizer is None:
+        yield
+        return
+    learns, normalizer.training = normalizer.training, False
+    try:
+        yield
+    finally:
+        normalizer.training = learns
