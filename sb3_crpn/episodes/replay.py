@@ -79,8 +79,7 @@ class Replay:
         ratios: FloatArray,
         *,
         baseline: bool,
-        normalize_advantage: bool,
-        discount_visitation: bool,
+        **weighting: bool,
     ) -> EpisodeBatch:
         clipped_ratios = np.minimum(ratios, 1.0)
         advantages = generalized_advantages(
@@ -97,8 +96,7 @@ class Replay:
             batch.lengths,
             batch.times,
             gamma=self._gamma,
-            normalize_advantage=normalize_advantage,
-            discount_visitation=discount_visitation,
+            **weighting,
         )
         return replace(
             batch,
