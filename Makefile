@@ -50,7 +50,7 @@ lint: venv
 	$(BIN)/mypy
 
 test: lint
-	OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses auto --cov --cov-fail-under 95
+	OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses auto --dist worksteal --cov --cov-fail-under 95
 
 format: venv
 	$(BIN)/ruff check --fix .

@@ -9,6 +9,7 @@ import hashlib
 import json
 import platform
 import tempfile
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -24,10 +25,12 @@ from sb3_crpn import ACRPN, CRPN, PAPER
 from sb3_crpn.distributed import rank
 from tests.envs import Drift, Sampler
 from tests.ranks import run_ranks
-from tests.training import make
+from tests.training import make as make_model
 
 SNAPSHOT = Path(__file__).with_name("determinism.json")
 N_UPDATES = 3
+
+make = partial(make_model, net_arch=(8,))  # of the recorded parameters
 
 
 def _sampler():

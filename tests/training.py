@@ -13,9 +13,12 @@ both = pytest.mark.parametrize("algorithm", [CRPN, ACRPN])
 
 
 def make(
-    algorithm, env=None, *, policy="MlpPolicy", net_arch=(8,), policy_kwargs=None, **arguments
+    algorithm, env=None, *, policy="MlpPolicy", net_arch=(4,), policy_kwargs=None, **arguments
 ):
-    """Return a small model, in Drift unless told otherwise."""
+    """Return a small model, in Drift unless told otherwise.
+
+    The work of a dense step is in proportion to the number of parameters.
+    """
     if algorithm is ACRPN:
         arguments.setdefault("subsolver_steps", 30)
     settings = {"n_steps": 32, "seed": 0, "device": "cpu", "n_critic_updates": 2} | arguments
