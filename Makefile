@@ -65,9 +65,10 @@ docs: $(DOCS)
 tables: venv
 	$(BIN)/python -m benchmarks.documentation
 
-# Every supported Python, with the oldest and with the newest dependencies: see noxfile.py
+# Every supported Python, with the oldest and with the newest dependencies: see noxfile.py.
+# TESTS=tests runs the whole suite in each cell
 matrix: venv
-	$(BIN)/nox
+	$(BIN)/nox -- $(TESTS)
 
 # The versions that the tests passed with; "+cpu" names a build, not a version
 lock: $(DOCS)

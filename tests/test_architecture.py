@@ -25,10 +25,11 @@ LAYERS = {
     "distributed": {"arrays"},
     "vec_env": {"arrays"},
     "policy": {"arrays", "parameters"},
-    "episodes": {"arrays", "distributed", "policy"},
+    "episodes": {"arrays", "progress", "distributed", "policy"},
     "curvature": GROUND | {"progress", "cubic", "parameters", "policy", "episodes"},
     "algorithm": GROUND
-    | {"cubic", "parameters", "policy", "distributed", "vec_env", "episodes", "curvature"},
+    | {"progress", "cubic", "parameters", "policy", "distributed", "vec_env", "episodes"}
+    | {"curvature"},
     "crpn": {"episodes", "algorithm"},
     "acrpn": {"checks", "episodes", "algorithm"},
     "sosp": GROUND

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -462,6 +463,22 @@ def test_estimate_curvature_leaves_running_statistics():
     model.estimate_curvature(4)
     assert env.training
     np.testing.assert_equal((env.obs_rms.mean, env.obs_rms.count, env.ret_rms.count), statistics)
+
+
+def test_estimate_curvature_shows_its_episodes(capsys):
+    plain = make(CRPN, several(2)).estimate_curvature(5)
+    assert "episodes" not in "".join(capsys.readouterr())
+    shown = make(CRPN, several(2)).estimate_curvature(5, progress_bar=True)
+    assert "5/5" in "".join(capsys.readouterr())
+    assert torch.equal(shown.gradient, plain.gradient)
+
+
+def test_estimate_curvature_tells_of_a_missing_bar_before_it_simulates(monkeypatch):
+    monkeypatch.setitem(sys.modules, "tqdm.rich", None)
+    model = make(CRPN)
+    with pytest.raises(ImportError, match="tqdm and rich"):
+        model.estimate_curvature(2, progress_bar=True)
+    assert model._last_obs is None
 
 
 class Estimate(BaseCallback):

@@ -8,11 +8,14 @@ at a time, REINFORCE from the same episodes and CRPN's default arguments, all fo
 
 Before the first and after the last update two more batches of 100 episodes are simulated: the
 leftmost eigenvector v of one batch's Hessian H is confirmed where another batch's H' has as much
-curvature along it, vᵀH'v/λ_min(H) = 1, and noise where that ratio is about 0.
+curvature along it, vᵀH'v/λ_min(H) = 1, and noise where that ratio is about 0. The ratio is missing
+where the last policy's Hessian is not finite.
 """
 
 from __future__ import annotations
 
+import itertools
+from contextlib import suppress
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -73,7 +76,8 @@ def measure(env: str, learner: str, seed: int, timesteps: int | None = None) -> 
     model.learn(10**12, callback=updates)
     updates.rows[0]["confirmed"] = before
     if confirms:
-        updates.rows[-1]["confirmed"] = confirmed_share(model)
+        with suppress(ValueError):  # the Hessian of the last policy is not finite
+            updates.rows[-1]["confirmed"] = confirmed_share(model)
     return updates.rows
 
 
@@ -164,7 +168,10 @@ def table(rows: pd.DataFrame) -> str:
             "-λ_min(H)/multiplier", "step", "KL", "largest KL", "confirmed, before",
             "after"]  # fmt: skip
     body = []
-    for (env, learner), group in rows.groupby(["env", "learner"], sort=False):
+    for env, learner in itertools.product(TIMESTEPS, LEARNERS):
+        group = rows[(rows.env == env) & (rows.learner == learner)]
+        if group.empty:
+            continue
         runs = group.groupby("seed")
         cells = [
             f"{runs.ngroups}",
@@ -177,7 +184,7 @@ def table(rows: pd.DataFrame) -> str:
             _median(group.step_norm),
             _median(group.kl_divergence),
             f"{group.kl_divergence.max():.2g}",
-            *(_listed(getattr(runs.confirmed, end)()) for end in ("first", "last")),
+            *(_listed(end.confirmed) for end in (runs.head(1), runs.tail(1))),
         ]
         body.append([env, learner, *cells])
     return markdown(head, body)

@@ -19,12 +19,13 @@ from sb3_crpn.distributed import local_count, world_size
 from sb3_crpn.episodes import (
     Collector,
     EpisodeRolloutBuffer,
-    EpisodeTracker,
     RolloutSize,
+    TickingTracker,
     Tracker,
     Transition,
     steps_to_quota,
 )
+from sb3_crpn.progress import progress
 
 # An environment without a known time limit counts as endless once an episode outlasts the budget
 # of ``learn``, but not before so many steps
@@ -209,7 +210,7 @@ class RolloutAlgorithm(OnPolicyAlgorithm, PolicyNewtonSettings):
         self._trajectory_times = collector.times
 
     def _collect_evaluation_episodes(
-        self, n_episodes: int, env: VecEnv | None
+        self, n_episodes: int, env: VecEnv | None, show: bool
     ) -> EpisodeRolloutBuffer:
         """Simulate whole episodes outside training: no callbacks, no timesteps counted.
 
@@ -222,13 +223,13 @@ class RolloutAlgorithm(OnPolicyAlgorithm, PolicyNewtonSettings):
         buffer = self._new_buffer(target.num_envs)
         normalizer = unwrap_vec_normalize(target)
         learns = normalizer is not None and normalizer.training
-        with _Rollout(self, target):
+        size = RolloutSize(self.n_steps, local_count(n_episodes), self.horizon)
+        with progress("episodes", size.n_episodes, show=show) as tick, _Rollout(self, target):
             try:
                 if normalizer is not None:
                     normalizer.training = False
                 collector = self._collector(target)
-                size = RolloutSize(self.n_steps, local_count(n_episodes), self.horizon)
-                collector.collect(buffer, EpisodeTracker(), size)
+                collector.collect(buffer, TickingTracker(tick), size)
             finally:
                 if normalizer is not None:
                     normalizer.training = learns

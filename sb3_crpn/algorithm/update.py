@@ -21,7 +21,7 @@ from sb3_crpn.algorithm.settings import CheckedSchedule
 from sb3_crpn.algorithm.solvers import SubproblemSolver
 from sb3_crpn.algorithm.statistics import UpdateStats
 from sb3_crpn.algorithm.step import PolicyStep, take_step
-from sb3_crpn.checks import COUNT, NONE, real, requires
+from sb3_crpn.checks import COUNT, FLAG, NONE, real, requires
 from sb3_crpn.curvature import (
     HESSIAN_ESTIMATORS,
     METRICS,
@@ -105,7 +105,9 @@ class PolicyNewtonUpdate(RolloutAlgorithm):
         self.last_update.write(self.logger)
 
     @torch.enable_grad()
-    def estimate_curvature(self, n_episodes: int, env: VecEnv | None = None) -> CurvatureEstimate:
+    def estimate_curvature(
+        self, n_episodes: int, env: VecEnv | None = None, *, progress_bar: bool = False
+    ) -> CurvatureEstimate:
         """Estimate gradient and Hessian of J at the current policy from fresh episodes.
 
         The estimators are those of the constructor's arguments; nothing is learnt, and the
@@ -117,11 +119,14 @@ class PolicyNewtonUpdate(RolloutAlgorithm):
             Number of episodes, used for the gradient and for the Hessian alike.
         env
             Where to simulate; ``None``: the training environment.
+        progress_bar
+            Show the episodes simulated, on each rank its own; needs tqdm and rich.
         """
         n_episodes = COUNT("estimate_curvature: n_episodes", n_episodes)
         env = (_VEC_ENV | NONE)("estimate_curvature: env", env)
+        show = FLAG("estimate_curvature: progress_bar", progress_bar)
         share_policy(self.policy)
-        batch = self._episode_batch(self._collect_evaluation_episodes(n_episodes, env))
+        batch = self._episode_batch(self._collect_evaluation_episodes(n_episodes, env, show))
         return self._estimate_from(batch)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:

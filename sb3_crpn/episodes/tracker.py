@@ -14,6 +14,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from sb3_crpn.arrays import BoolArray, IntArray
+from sb3_crpn.progress import Tick
 
 
 @dataclass(frozen=True)
@@ -159,6 +160,20 @@ class EpisodeTracker:
         """Take note that all environments were reset."""
         self._length[:] = 0
         self._recording = self._remaining > 0
+
+
+class TickingTracker(EpisodeTracker):
+    """Tells a progress bar of each episode that it keeps."""
+
+    def __init__(self, tick: Tick) -> None:
+        super().__init__()
+        self._tick = tick
+
+    def advance(self, dones: BoolArray) -> Iterator[Segment]:
+        """Take note of one step of every environment and yield the episodes that it ended."""
+        for segment in super().advance(dones):
+            self._tick(1)
+            yield segment
 
 
 class TimestepTracker:

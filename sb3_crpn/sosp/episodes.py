@@ -11,33 +11,17 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_crpn.arrays import BoolArray
 from sb3_crpn.episodes import (
     Collector,
     DictEpisodeRolloutBuffer,
     EpisodeBatch,
     EpisodeRolloutBuffer,
-    EpisodeTracker,
     RolloutSize,
-    Segment,
+    TickingTracker,
 )
 from sb3_crpn.episodes.batch import discount_factors
 from sb3_crpn.policy import state_values
 from sb3_crpn.progress import Tick
-
-
-class _TickingTracker(EpisodeTracker):
-    """Tells of each episode that it keeps."""
-
-    def __init__(self, tick: Tick) -> None:
-        super().__init__()
-        self._tick = tick
-
-    def advance(self, dones: BoolArray) -> Iterator[Segment]:
-        """Take note of one step of every environment and yield the episodes that it ended."""
-        for segment in super().advance(dones):
-            self._tick(1)
-            yield segment
 
 
 @contextmanager
@@ -108,8 +92,7 @@ def collect_episodes(
     collector.reset()
     buffer = _new_buffer(policy, env.num_envs, gamma)
     size = RolloutSize(n_steps=0, n_episodes=n_episodes, horizon=horizon)
-    tracker = _TickingTracker(tick)
-    collector.collect(buffer, tracker, size)
+    collector.collect(buffer, TickingTracker(tick), size)
     return buffer.episode_batch(baseline=False, normalize_advantage=False, discount_visitation=True)
 
 

@@ -37,3 +37,14 @@ def test_an_update_is_recorded_with_what_it_learnt_from():
     assert row["step_norm"] == pytest.approx(1e-3 * row["gradient_norm"], rel=1e-3)
     rows = pd.DataFrame([{"env": "Reacher-v5", "learner": "REINFORCE", "seed": 0} | row])
     assert "| Reacher-v5 | REINFORCE | 1 | 1 |" in mujoco.table(rows)
+
+
+def test_a_share_that_is_missing_after_training_is_not_the_one_before():
+    rows = [
+        {"env": "Humanoid-v5", "learner": "CRPN, paper", "seed": seed, "update": update}
+        | dict.fromkeys(("mean_return", *mujoco.LOGGED, "kl_divergence"), 1.0)
+        | {"confirmed": confirmed}
+        for seed, run in enumerate([(0.25, float("nan"), float("nan")), (0.5, float("nan"), -2.0)])
+        for update, confirmed in enumerate(run, 1)
+    ]
+    assert mujoco.table(pd.DataFrame(rows)).endswith("| 0.25, 0.5 | -2 |")
