@@ -16,7 +16,7 @@ import nox
 PYTHONS = ["3.10", "3.11", "3.12", "3.13"]
 # uv's names: every direct dependency at its lower bound, or the newest release
 RESOLUTIONS = ["lowest-direct", "highest"]
-# Training, saving, loading and rl-zoo's scripts: a minute or two where the whole suite takes an hour
+# Training, saving, loading and rl-zoo's scripts: a minute or two; the whole suite takes an hour
 SELECTION = [
     "tests/test_acrpn.py",
     "tests/test_sb3_contract.py",

@@ -4,7 +4,7 @@
 
 PyTorch and Gymnasium alone; episodes and Ψ are those of crpn_minimal.py. H̄_k is known by products
 H̄_k[v] only. Comments that begin with "Alg. 2" quote the paper; "meant" says what it cannot mean
-(docs/THEORY.md, "Slips"). A test compares an update with ``ACRPN(**PAPER)``'s.
+(docs/THEORY.md, "Errata"). A test compares an update with ``ACRPN(**PAPER)``'s.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Minimisers of the cubic model ``m(s) = g·s + ½ sᵀHs + (α/6)‖s‖³``; mathematics only, no RL."""
+"""Solvers of the cubic model ``m(s) = g·s + ½ sᵀHs + (α/6)‖s‖³``. The package knows no RL."""
 
 from sb3_crpn.cubic.approximate import cubic_finalsolver, cubic_subsolver
 from sb3_crpn.cubic.dense import solve_dense

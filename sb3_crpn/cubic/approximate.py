@@ -1,9 +1,9 @@
 """The approximate solvers of ACRPN: Cauchy step and gradient descent on the cubic model.
 
 Cubic-Subsolver and Cubic-Finalsolver of Maniyar et al. 2024 (AISTATS), Algorithm 2, after
-Tripuraneni et al. 2018 (NeurIPS), Algorithms 3 and 4, with ρ = α, ℓ = ``gradient_lipschitz``,
-ε = ``epsilon``. Where the code corrects the paper it says "Correction". O(d) memory: a handful of
-vectors.
+Tripuraneni et al. 2018 (NeurIPS), Algorithms 3 and 4. Symbols: ρ = ``alpha``,
+ℓ = ``gradient_lipschitz``, ε = ``epsilon``, N̂ = ``max_steps``. A comment that begins with
+"Correction" marks each place where the code corrects the paper. Memory is O(d).
 """
 
 import math
@@ -21,21 +21,32 @@ from sb3_crpn.cubic.step import EPS, CountedOperator, CubicStep, random_unit_vec
 # Step size 1/(20ℓ) (Tripuraneni et al. 2018, Algorithms 3 and 4)
 _STEP_DIVISOR = 20
 
-# Most gradient steps by default; the theory's N̂ is unbounded as ρε → 0
+# Upper limit of the default N̂, which grows without bound as ρε → 0
 _MAX_STEPS = 10_000
 
-# Lanczos products for ℓ: 10 gave 1.00 to 1.55 times ‖H‖, never less, on 900 random starts
-# (uniform, decaying, outlying and semicircle spectra, d = 2 to 5000)
+# Lanczos products for ℓ. The estimate from 10 products was 1.00 to 1.55 times ‖H‖ on 900 random
+# starts (uniform, decaying, outlying and semicircle spectra, d = 2 to 5000)
 _LIPSCHITZ_PRODUCTS = 10
 
-# The subsolver stops early where the gradient is below this part of σ/√d, the share of the
-# perturbation that falls on one direction: a hidden direction would still show. The share is
-# smaller with probability 0.1 %
-_UNNOTICED = 1e-3
+# The subsolver stops early once ‖∇m‖ is below this multiple of σ/√d. One component of the
+# perturbation σζ has the size σ/√d, and is below the multiple with probability 0.1 %. A direction
+# of negative curvature that only the perturbation excites therefore keeps ‖∇m‖ above it
+_TOLERANCE = 1e-3
 
 
-class _Descent(NamedTuple):
-    """A step Δ, HΔ and how it was come by, for people."""
+class _Problem(NamedTuple):
+    """The checked arguments of both solvers: g, the operator H, ρ, ℓ, ε and N̂."""
+
+    g: Tensor
+    operator: CountedOperator
+    rho: float
+    lipschitz: float
+    epsilon: float
+    max_steps: int | None
+
+
+class _Candidate(NamedTuple):
+    """A step Δ, the product HΔ and the status of the solve."""
 
     step: Tensor
     product: Tensor
@@ -56,8 +67,9 @@ def cubic_subsolver(
 
     .. math:: m(s) = g \cdot s + \tfrac12 s^T H s + \tfrac\rho6 \|s\|^3
 
-    A large gradient, ‖g‖ ≥ ℓ²/ρ, calls for the Cauchy step; otherwise gradient descent runs on
-    the model of g̃ = g + σζ, ζ uniform on the unit sphere, so that it leaves saddles.
+    The Cauchy step is taken where ‖g‖ ≥ ℓ²/ρ. Otherwise gradient descent runs on the model of the
+    perturbed gradient g̃ = g + σζ, ζ uniform on the unit sphere. The perturbation lets the descent
+    leave saddle points.
 
     Parameters
     ----------
@@ -66,49 +78,39 @@ def cubic_subsolver(
     hvp
         v ↦ Hv, float64 Tensor[d] to Tensor[d].
     alpha
-        ρ > 0. Correction: the paper admits 0, for which the model has no minimiser.
+        ρ > 0. Correction: the paper admits ρ = 0, for which the model may have no minimiser.
     gradient_lipschitz
-        ℓ ≥ ‖H‖, ≥ 0; None: `estimate_lipschitz`, its products counted.
+        ℓ ≥ ‖H‖, ≥ 0. None: the value of `estimate_lipschitz`; its products are counted.
     epsilon
-        ε > 0, the gradient norm sought, in the units of g.
+        ε > 0, the tolerance of ‖∇J‖, in the units of g.
     max_steps
-        N̂ ≥ 1; None: ⌈20ℓ/√(ρε)·log(1 + 20√d·ℓ²/(ρε))⌉, at most 10 000.
+        N̂ ≥ 1. None: ⌈20ℓ/√(ρε)·log(1 + 20√d·ℓ²/(ρε))⌉, at most 10 000.
     seed
-        Of ζ; the global generator is not touched.
+        Seed of ζ. PyTorch's global generator is not used.
 
     Returns
     -------
     CubicStep
-        ``predicted_decrease`` is of the model of g, not of g̃, and may be slightly negative.
-        Never ``certified``: nothing is known of H + λI ⪰ 0.
+        ``predicted_decrease`` refers to the model of g, not of g̃, and may be slightly negative.
+        ``certified`` is always False: the solver does not test H + λI ⪰ 0.
 
     Raises
     ------
     ValueError
         For a wrong shape, a non-finite number (products included), α, ε ≤ 0, ℓ < 0, N̂ < 1.
     """
-    g = as_vector("cubic_subsolver: gradient", gradient)
-    rho, epsilon = (
-        POSITIVE("cubic_subsolver: alpha", alpha),
-        POSITIVE("cubic_subsolver: epsilon", epsilon),
-    )
-    operator = CountedOperator("cubic_subsolver: hvp", hvp)
-    max_steps = (COUNT | NONE)("cubic_subsolver: max_steps", max_steps)
-    given = (real(0.0) | NONE)("cubic_subsolver: gradient_lipschitz", gradient_lipschitz)
-    seed = SEED("cubic_subsolver: seed", seed)
-    # Correction: the paper supposes ℓ known; here it is estimated if not given
-    lipschitz = estimate_lipschitz(operator, g) if given is None else given
-    steps = _descent_steps(max_steps, lipschitz, rho, epsilon, g.numel())
-
-    norm = float(torch.linalg.vector_norm(g))
-    if rho * norm >= lipschitz**2:
-        return _report(g, operator, rho, _cauchy_step(g, operator, rho))
-    # Correction: σ = c'√(ερ)/ℓ, with a c' that the text lacks, is no gradient; ε√(ρε)/ℓ is one
+    name = "cubic_subsolver"
+    seed = SEED(f"{name}: seed", seed)
+    problem = _checked(name, gradient, hvp, alpha, gradient_lipschitz, epsilon, max_steps)
+    g, _, rho, lipschitz, epsilon, _ = problem
+    if rho * float(torch.linalg.vector_norm(g)) >= lipschitz**2:
+        return _cubic_step(problem, _cauchy_step(problem))
+    # Correction: the paper's σ = c'√(ερ)/ℓ has not the units of a gradient and leaves c' undefined.
+    # ε√(ρε)/ℓ has them
     sigma = epsilon * math.sqrt(rho * epsilon) / lipschitz
-    perturbed = g + sigma * random_unit_vector(g, seed)
-    target = _UNNOTICED * sigma / math.sqrt(g.numel())
-    descent = _descend(perturbed, operator, rho, lipschitz, target, steps)
-    return _report(g, operator, rho, descent)
+    perturbed = problem._replace(g=g + sigma * random_unit_vector(g, seed))
+    tolerance = _TOLERANCE * sigma / math.sqrt(g.numel())
+    return _cubic_step(problem, _gradient_descent(perturbed, tolerance))
 
 
 def cubic_finalsolver(
@@ -124,26 +126,16 @@ def cubic_finalsolver(
 
     .. math:: \|\nabla m(s)\| = \|g + Hs + \tfrac\rho2\|s\|s\| \le \varepsilon/2
 
-    Gradient descent from 0 with step 1/(20ℓ); where ‖g‖ > ℓ²/ρ, outside the paper's use of it,
-    ℓ is replaced by √(ρ‖g‖), for which the steps are stable (ℓ = 0 included).
+    Gradient descent from 0 with step size 1/(20ℓ). Where ‖g‖ > ℓ²/ρ, a case that Algorithm 2
+    excludes, √(ρ‖g‖) replaces ℓ. The descent is then stable, also for ℓ = 0.
 
-    Parameters, result and errors are those of `cubic_subsolver`; no randomness but in the
-    estimate of ℓ.
+    Parameters, result and errors are those of `cubic_subsolver`. Only the estimate of ℓ is random.
     """
-    g = as_vector("cubic_finalsolver: gradient", gradient)
-    rho, epsilon = (
-        POSITIVE("cubic_finalsolver: alpha", alpha),
-        POSITIVE("cubic_finalsolver: epsilon", epsilon),
-    )
-    operator = CountedOperator("cubic_finalsolver: hvp", hvp)
-    max_steps = (COUNT | NONE)("cubic_finalsolver: max_steps", max_steps)
-    given = (real(0.0) | NONE)("cubic_finalsolver: gradient_lipschitz", gradient_lipschitz)
-    # Correction: the paper supposes ℓ known; here it is estimated if not given
-    lipschitz = estimate_lipschitz(operator, g) if given is None else given
-    curvature = max(lipschitz, math.sqrt(rho * float(torch.linalg.vector_norm(g))))
-    steps = _descent_steps(max_steps, curvature, rho, epsilon, g.numel())
-    descent = _descend(g, operator, rho, curvature, epsilon / 2, steps)
-    return _report(g, operator, rho, descent)
+    name = "cubic_finalsolver"
+    problem = _checked(name, gradient, hvp, alpha, gradient_lipschitz, epsilon, max_steps)
+    norm = float(torch.linalg.vector_norm(problem.g))
+    stable = problem._replace(lipschitz=max(problem.lipschitz, math.sqrt(problem.rho * norm)))
+    return _cubic_step(problem, _gradient_descent(stable, problem.epsilon / 2))
 
 
 def estimate_lipschitz(
@@ -151,20 +143,20 @@ def estimate_lipschitz(
 ) -> float:
     """Estimate ℓ = ‖H‖₂ by a few Lanczos products from a random start.
 
-    Returns max|θ| + ‖r‖, θ the Ritz values and r the remainder of the last product: the
-    safeguarded bound of Zhou & Li 2011 (Linear Algebra Appl. 435), which rarely falls below
-    ‖H‖. Three vectors of memory, hence no reorthogonalisation.
+    Returns max|θ| + ‖r‖, θ the Ritz values and r the residual vector of the last Lanczos step. It
+    is the safeguarded bound of Zhou & Li 2011 (Linear Algebra Appl. 435), which is rarely below
+    ‖H‖. Lanczos runs without reorthogonalisation, to keep three vectors only.
 
     Parameters
     ----------
     hvp
         v ↦ Hv, Tensor[d] to Tensor[d].
     like
-        A tensor of the dimension, dtype and device of v.
+        A tensor with the size, dtype and device of v.
     products
-        Most products spent, ≥ 1; fewer where the Krylov space is invariant before.
+        Maximum number of products, ≥ 1. Lanczos stops earlier on an invariant Krylov space.
     seed
-        Of the random start; the global generator is not touched.
+        Seed of the random start. PyTorch's global generator is not used.
     """
     products = COUNT("estimate_lipschitz: products", products)
     seed = SEED("estimate_lipschitz: seed", seed)
@@ -186,9 +178,9 @@ def estimate_lipschitz(
 
 
 def cauchy_radius(norm: float, curvature: float, rho: float) -> float:
-    """Minimise ``-‖g‖R + ½hR² + (ρ/6)R³`` over R ≥ 0, ``curvature`` h = ĝᵀHĝ.
+    """Return the minimiser R ≥ 0 of ``-‖g‖R + ½hR² + (ρ/6)R³``, ``curvature`` h = ĝᵀHĝ.
 
-    The positive root of (ρ/2)R² + hR - ‖g‖, in the form without cancellation.
+    R is the positive root of (ρ/2)R² + hR - ‖g‖, in the form without cancellation.
     """
     root = math.hypot(curvature, math.sqrt(2 * rho) * math.sqrt(norm))
     if curvature > 0:
@@ -196,54 +188,89 @@ def cauchy_radius(norm: float, curvature: float, rho: float) -> float:
     return (root - curvature) / rho
 
 
-def _cauchy_step(g: Tensor, operator: CountedOperator, rho: float) -> _Descent:
-    """Minimise the model along -g: one product; none, and no step, where g = 0.
+def _checked(
+    name: str,
+    gradient: ArrayLike,
+    hvp: Operator,
+    alpha: float,
+    gradient_lipschitz: float | None,
+    epsilon: float,
+    max_steps: int | None,
+) -> _Problem:
+    """Check the arguments of the solver ``name``, and estimate ℓ if it is None."""
+    g = as_vector(f"{name}: gradient", gradient)
+    rho = POSITIVE(f"{name}: alpha", alpha)
+    epsilon = POSITIVE(f"{name}: epsilon", epsilon)
+    operator = CountedOperator(f"{name}: hvp", hvp)
+    max_steps = (COUNT | NONE)(f"{name}: max_steps", max_steps)
+    lipschitz = (real(0.0) | NONE)(f"{name}: gradient_lipschitz", gradient_lipschitz)
+    if lipschitz is None:  # Correction: the paper supposes ℓ known
+        lipschitz = estimate_lipschitz(operator, g)
+    return _Problem(g, operator, rho, lipschitz, epsilon, max_steps)
 
-    Correction: Algorithm 2's R_c mixes ḡ and g, which is nowhere defined, and has ‖ḡ²‖ for ‖ḡ‖².
+
+def _cauchy_step(problem: _Problem) -> _Candidate:
+    """Minimise the model along -g with one product; return 0 if g = 0.
+
+    Correction: Algorithm 2's R_c contains an undefined g besides ḡ, and ‖ḡ²‖ in place of ‖ḡ‖².
     """
+    g = problem.g
     norm = float(torch.linalg.vector_norm(g))
     if norm == 0:
-        return _Descent(
-            torch.zeros_like(g),
-            torch.zeros_like(g),
-            "no step: gradient and gradient_lipschitz are 0",
-        )
+        zero = torch.zeros_like(g)
+        return _Candidate(zero, zero, "no step: gradient and gradient_lipschitz are 0")
     direction = g / norm
-    product = operator(direction)
-    radius = cauchy_radius(norm, float(direction @ product), rho)
-    return _Descent(-radius * direction, -radius * product, "Cauchy step")
+    product = problem.operator(direction)
+    radius = cauchy_radius(norm, float(direction @ product), problem.rho)
+    return _Candidate(-radius * direction, -radius * product, "Cauchy step")
 
 
-def _descend(
-    g: Tensor, operator: CountedOperator, rho: float, lipschitz: float, target: float, steps: int
-) -> _Descent:
-    """Run gradient descent on the model from 0 until ‖∇m‖ ≤ target; one product a step.
+def _gradient_descent(problem: _Problem, tolerance: float) -> _Candidate:
+    """Run gradient descent on the model from 0 until ‖∇m‖ ≤ ``tolerance``; one product a step.
 
-    Correction: the slope is ∇m = g + H[Δ] + (ρ/2)‖Δ‖Δ. The Finalsolver as printed,
-    ḡ_J ← ḡ_J + H[Δ] + (ρ/2)‖Δ‖Δ, adds up the slopes of all iterates. It stops where the sum is
-    small, if it does; ∇m is hardly ever small there.
+    Correction: the gradient is ∇m = g + H[Δ] + (ρ/2)‖Δ‖Δ. The Finalsolver as printed,
+    ḡ_J ← ḡ_J + H[Δ] + (ρ/2)‖Δ‖Δ, adds up the gradients of all iterates. Where that sum is small,
+    ∇m is rarely small.
     """
+    g, operator, rho, lipschitz = problem[:4]
+    max_steps = _max_steps(problem)
     step, product = torch.zeros_like(g), torch.zeros_like(g)
-    # with ‖H‖ ≤ ℓ, m > 0 beyond the root of (ρ/6)R² = (ℓ/2)R + ‖g‖, and descent keeps m ≤ 0
+    # With ‖H‖ ≤ ℓ, m > 0 beyond the positive root of (ρ/6)R² = (ℓ/2)R + ‖g‖. Descent keeps m ≤ 0
     force = rho * float(torch.linalg.vector_norm(g))
-    farthest = 3 / rho * (lipschitz / 2 + math.sqrt(lipschitz**2 / 4 + 2 / 3 * force))
-    for count in range(steps + 1):
+    max_norm = 3 / rho * (lipschitz / 2 + math.sqrt(lipschitz**2 / 4 + 2 / 3 * force))
+    for count in range(max_steps + 1):
         norm = torch.linalg.vector_norm(step)
-        slope = g + product + rho / 2 * norm * step
-        if float(norm) > farthest:
+        model_gradient = g + product + rho / 2 * norm * step
+        if float(norm) > max_norm:
             zero = torch.zeros_like(g)
-            return _Descent(zero, zero, f"diverged: gradient_lipschitz < ‖H‖, {lipschitz:.3g} used")
-        if float(torch.linalg.vector_norm(slope)) <= target:
-            return _Descent(step, product, f"gradient descent: converged in {count} steps")
-        if count < steps:
-            step = step - slope / (_STEP_DIVISOR * lipschitz)
+            status = f"diverged: gradient_lipschitz < ‖H‖, {lipschitz:.3g} used"
+            return _Candidate(zero, zero, status)
+        if float(torch.linalg.vector_norm(model_gradient)) <= tolerance:
+            return _Candidate(step, product, f"gradient descent: converged in {count} steps")
+        if count < max_steps:
+            step = step - model_gradient / (_STEP_DIVISOR * lipschitz)
             product = operator(step)
-    return _Descent(step, product, f"gradient descent: not converged in {steps} steps")
+    return _Candidate(step, product, f"gradient descent: not converged in {max_steps} steps")
 
 
-def _report(g: Tensor, operator: CountedOperator, rho: float, descent: _Descent) -> CubicStep:
-    """Judge a step by the model of the unperturbed gradient."""
-    step, product, status = descent
+def _max_steps(problem: _Problem) -> int:
+    """Return N̂.
+
+    Correction: the paper's N̂ = 1/√ε lacks the factor ℓ/√ρ, without which N̂ has units, and a
+    logarithm. A direction of curvature -√(ρε) grows by the factor 1 + √(ρε)/(20ℓ) a step. It
+    starts from the perturbation's component σ/(20ℓ√d). The cubic term stops it at √(ε/ρ).
+    """
+    if problem.max_steps is not None:
+        return problem.max_steps
+    ratio = problem.lipschitz / math.sqrt(problem.rho * problem.epsilon)
+    growth = math.log1p(_STEP_DIVISOR * math.sqrt(problem.g.numel()) * ratio**2)
+    return max(1, min(_MAX_STEPS, math.ceil(_STEP_DIVISOR * ratio * growth)))
+
+
+def _cubic_step(problem: _Problem, candidate: _Candidate) -> CubicStep:
+    """Evaluate the candidate by the model of the unperturbed gradient."""
+    g, rho = problem.g, problem.rho
+    step, product, status = candidate
     norm = float(torch.linalg.vector_norm(step))
     multiplier = rho / 2 * norm
     return CubicStep(
@@ -251,24 +278,8 @@ def _report(g: Tensor, operator: CountedOperator, rho: float, descent: _Descent)
         multiplier=multiplier,
         # -δ_J of Algorithm 2, J̄_k(θ_k) - J̄_k(θ_k + Δ): the model with ḡ, not with the perturbed g̃
         predicted_decrease=0.0 - float(g @ step + step @ product / 2) - rho / 6 * norm**3,
-        products=operator.count,
+        products=problem.operator.count,
         residual=float(torch.linalg.vector_norm(product + multiplier * step + g)),
         certified=False,
         status=status,
     )
-
-
-def _descent_steps(
-    given: int | None, lipschitz: float, rho: float, epsilon: float, dim: int
-) -> int:
-    """Return N̂.
-
-    Correction: the paper's N̂ = 1/√ε lacks ℓ/√ρ, and with it has no units, and a logarithm. A
-    direction of curvature -√(ρε) grows by 1 + √(ρε)/(20ℓ) a step, from the perturbation's share
-    σ/(20ℓ√d) to the length √(ε/ρ) where the cubic term takes over.
-    """
-    if given is not None:
-        return given
-    ratio = lipschitz / math.sqrt(rho * epsilon)
-    growth = math.log1p(_STEP_DIVISOR * math.sqrt(dim) * ratio**2)
-    return max(1, min(_MAX_STEPS, math.ceil(_STEP_DIVISOR * ratio * growth)))

@@ -7,9 +7,9 @@ import torch
 from sb3_crpn.arrays import ArrayLike, FloatArray, as_symmetric, as_vector
 from sb3_crpn.checks import POSITIVE
 from sb3_crpn.cubic.secular import solve_secular
-from sb3_crpn.cubic.step import EPS, ROUNDING, CubicStep, residual_limit
+from sb3_crpn.cubic.step import EPS, ROUNDING, CubicStep, residual_tolerance
 
-# Relative residual of a certified step, as solve_krylov's default
+# Relative residual of a certified step, the default of solve_krylov
 _TOL = 1e-8
 
 
@@ -20,15 +20,16 @@ def solve_dense(
 
     .. math:: \min_s\; g \cdot s + \tfrac12 s^T H s + \tfrac\alpha6 \|s\|_M^3
 
-    With the pencil's eigenvectors, VᵀHV = Λ and VᵀMV = I, the model is diagonal in y, s = Vy
-    (`solve_secular`; Cartis, Gould & Toint 2011, Math. Program. 127, §6.1).
+    V holds the eigenvectors of the pencil (H, M): VᵀHV = Λ and VᵀMV = I. In the coordinates y,
+    s = Vy, the model is diagonal, and `solve_secular` minimises it (Cartis, Gould & Toint 2011,
+    Math. Program. 127, §6.1).
 
     Parameters
     ----------
     gradient
         g, [d].
     hessian
-        H, [d, d]; only its symmetric part counts.
+        H, [d, d]. Its symmetric part is used.
     alpha
         α > 0, weight of the cubic term.
     metric
@@ -37,8 +38,8 @@ def solve_dense(
     Returns
     -------
     CubicStep
-        ``products`` is 0. ``certified`` is False where rounding spoiled the residual, as it
-        can with a metric that is nearly singular.
+        ``products`` is 0. ``certified`` is False if rounding errors make the residual too large,
+        which happens with a nearly singular metric.
 
     Raises
     ------
@@ -56,15 +57,19 @@ def solve_dense(
     solution = solve_secular(eigenvalues, gamma, alpha)
     s = V @ solution.coordinates
     Hs, Ms = H @ s, s if M is None else M @ s
-    # ‖s‖_M = ‖y‖, and sᵀMs would lose up to cond(M) of its digits
+    # ‖s‖_M = ‖y‖. sᵀMs has a relative rounding error of up to cond(M)·eps
     multiplier = alpha / 2 * float(np.linalg.norm(solution.coordinates))
 
     residual = float(np.linalg.norm(Hs + multiplier * Ms + g))
-    # Euclidean, the norm in which the residual is computed and rounded, whatever the metric
-    sizes = np.linalg.norm(H, 1) + multiplier * (1.0 if M is None else np.linalg.norm(M, 1))
-    limit = residual_limit(_TOL, float(np.linalg.norm(g)), float(sizes), float(np.linalg.norm(s)))
+    # Norms are Euclidean, since the residual is computed and rounded in Euclidean coordinates
+    curvature = float(
+        np.linalg.norm(H, 1) + multiplier * (1.0 if M is None else np.linalg.norm(M, 1))
+    )
+    tolerance = residual_tolerance(
+        _TOL, float(np.linalg.norm(g)), curvature, float(np.linalg.norm(s))
+    )
     slack = ROUNDING * EPS * (float(np.max(np.abs(eigenvalues))) + multiplier)
-    certified = bool(residual <= limit and multiplier + eigenvalues[0] >= -slack)
+    certified = bool(residual <= tolerance and multiplier + eigenvalues[0] >= -slack)
     return CubicStep(
         step=torch.from_numpy(s).to(vector.device),
         multiplier=multiplier,
@@ -78,7 +83,7 @@ def solve_dense(
 
 
 def _eigh(H: FloatArray, M: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-    """Return ascending eigenvalues and V of ``HV = MVΛ``; divide and conquer suits clusters."""
+    """Return Λ, ascending, and V of ``HV = MVΛ``. Divide and conquer is fast on clusters."""
     if M is None:
         eigenvalues, V = scipy.linalg.eigh(H, driver="evd")
         return eigenvalues, V

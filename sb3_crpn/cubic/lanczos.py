@@ -10,26 +10,32 @@ from sb3_crpn.arrays import ArrayLike, FloatArray, Operator, as_vector
 from sb3_crpn.checks import COUNT, SEED, integer
 from sb3_crpn.cubic.step import EPS, CountedOperator, random_unit_vector
 
-# krylov_basis takes a space for invariant where the remainder is below this multiple of EPS·‖A‖:
-# repeated eigenvalues left 5 to 27 for d = 30 to 3000, once 150 for d = 10
+# krylov_basis regards a space as invariant once the remainder is below this multiple of EPS·‖A‖.
+# With repeated eigenvalues the remainder was 5 to 27 times EPS·‖A‖ for d = 30 to 3000, and once
+# 150 times for d = 10
 _BREAKDOWN = 200.0
 
-# leftmost_eigenvalues takes an eigenvalue for found where its residual is below this part of ‖A‖
+# Relative residual of a converged Ritz pair in leftmost_eigenvalues
 _TOLERANCE = 1e-8
 
-# max_products=None: min(d, 1000), as for solve_krylov
-_MAX_PRODUCTS = 1000
+# The projected problem, O(k³), is solved again after 1 + k/16 products. At most 6 % of the
+# products are then superfluous
+SOLVE_INTERVAL = 16
+
+# max_products=None: min(d, 1000), and one more in solve_krylov. After d products the space is R^d.
+# 1000 vectors of d = 10⁵ take 0.8 GB
+MAX_PRODUCTS = 1000
 
 
 class KrylovSpace:
-    """Orthonormal basis Q [k, d] (rows) of a few Krylov chains of A, and P = QAQᵀ.
+    """Orthonormal basis Q [k, d] (rows) of the sum of several Krylov spaces of A, and P = QAQᵀ.
 
-    A chain grows from a start vector by Lanczos with full reorthogonalisation, one product a
-    vector. Its *end* is the part of its last product that the space lacks, so that
-    ``A Qᵀy - QᵀPy = Σ_chains y_last·end``: the residual of anything solved in the space is known
-    without a product. An end is None where the chain has broken down, its end below
-    ``breakdown``·EPS·‖A‖; the default keeps all that could show in a residual. The space depends
-    on A and the starts only, so that solving for another α costs no product.
+    A *chain* is the Lanczos sequence of one start vector, with full reorthogonalisation. It costs
+    one product a vector. Its *remainder* is the component of its last product orthogonal to the
+    space, whence ``A Qᵀy - QᵀPy = Σ_chains y_last·remainder``. The residual of any vector of the
+    space therefore costs no product. The remainder is None after a breakdown, where its norm is
+    below ``breakdown``·EPS·‖A‖. The default of 1 drops rounding errors only. The space depends on A
+    and the start vectors, not on α. Another α costs no product.
     """
 
     def __init__(self, operator: CountedOperator, like: Tensor, breakdown: float = 1.0) -> None:
@@ -39,7 +45,7 @@ class KrylovSpace:
         self.size = 0
         self.projected: FloatArray = np.zeros((0, 0))
         self.chains: list[list[int]] = []
-        self.ends: list[Tensor | None] = []
+        self.remainders: list[Tensor | None] = []
         self.norm = 0.0  # the largest ‖Aq‖ so far
         self._rows = like.new_empty(min(self.dim, 16), self.dim)
 
@@ -48,18 +54,18 @@ class KrylovSpace:
         """Q, Tensor[k, d]."""
         return self._rows[: self.size]
 
-    def open(self, start: Tensor) -> int:
-        """Begin a chain at ``start`` (≠ 0) and return its number; no product yet."""
+    def start_chain(self, start: Tensor) -> int:
+        """Start a chain at ``start`` (≠ 0), without a product, and return its index."""
         self.chains.append([])
-        self.ends.append(self._end(start, float(torch.linalg.vector_norm(start))))
+        self.remainders.append(self._remainder(start, float(torch.linalg.vector_norm(start))))
         return len(self.chains) - 1
 
     def extend(self, chain: int) -> Tensor | None:
-        """Add the end q of ``chain`` to the basis and return Aq, one product; None at its end."""
-        end = self.ends[chain]
-        if end is None:
+        """Add the next vector q of ``chain`` and return Aq, one product; None after a breakdown."""
+        remainder = self.remainders[chain]
+        if remainder is None:
             return None
-        q = self._outside(end / torch.linalg.vector_norm(end))
+        q = self._orthogonalise(remainder / torch.linalg.vector_norm(remainder))
         self._append(q / torch.linalg.vector_norm(q))
         self.chains[chain].append(self.size - 1)
 
@@ -68,9 +74,20 @@ class KrylovSpace:
         column = (self.basis @ product).cpu().numpy()
         self.projected = np.pad(self.projected, (0, 1))
         self.projected[-1, :] = self.projected[:, -1] = column
-        self.ends[chain] = product
-        self.ends = [None if e is None else self._end(e, self.norm) for e in self.ends]
+        self.remainders[chain] = product
+        self.remainders = [
+            None if vector is None else self._remainder(vector, self.norm)
+            for vector in self.remainders
+        ]
         return product
+
+    def residual(self, coordinates: FloatArray) -> Tensor:
+        """Return A Qᵀy - QᵀPy, [d], for y [k], without a product."""
+        residual = self._rows.new_zeros(self.dim)
+        for chain, remainder in zip(self.chains, self.remainders, strict=True):
+            if remainder is not None and chain:
+                residual += float(coordinates[chain[-1]]) * remainder
+        return residual
 
     def _append(self, row: Tensor) -> None:
         if self.size == len(self._rows):
@@ -79,34 +96,35 @@ class KrylovSpace:
         self._rows[self.size] = row
         self.size += 1
 
-    def _end(self, vector: Tensor, scale: float) -> Tensor | None:
-        outside = self._outside(self._outside(vector))  # twice is enough (Kahan, in Parlett 1980)
-        noise = self.breakdown * EPS * scale
-        full = self.size == self.dim
-        return None if full or float(torch.linalg.vector_norm(outside)) <= noise else outside
+    def _remainder(self, vector: Tensor, scale: float) -> Tensor | None:
+        # "twice is enough" (Kahan, in Parlett 1980)
+        remainder = self._orthogonalise(self._orthogonalise(vector))
+        negligible = float(torch.linalg.vector_norm(remainder)) <= self.breakdown * EPS * scale
+        return None if negligible or self.size == self.dim else remainder
 
-    def _outside(self, vector: Tensor) -> Tensor:
+    def _orthogonalise(self, vector: Tensor) -> Tensor:
         return vector - self.basis.T @ (self.basis @ vector)
 
 
 def krylov_basis(matvec: Operator, start: ArrayLike, dim: int) -> tuple[Tensor, Tensor]:
-    """Orthonormal basis of the Krylov space span{b, Ab, …, A^{dim-1}b}, A symmetric.
+    """Return a basis of the Krylov space span{b, Ab, …, A^{dim-1}b}, A symmetric, and its image.
 
-    Lanczos with full reorthogonalisation, at one product a column.
+    Lanczos with full reorthogonalisation, one product a column.
 
     Parameters
     ----------
     matvec
         v ↦ Av, float64 Tensor[d] to Tensor[d].
     start
-        b, [d]. Zero spans nothing: k = 0.
+        b, [d]. b = 0 gives k = 0.
     dim
-        Columns wanted, ≥ 1; more than d are d.
+        Maximum number of columns, ≥ 1.
 
     Returns
     -------
     tuple[Tensor, Tensor]
-        Q and AQ, [d, k], float64, k ≤ min(d, dim); fewer where the space is invariant before.
+        Orthonormal Q and AQ, [d, k], float64. k = min(d, dim), or the dimension of an invariant
+        Krylov space.
 
     Raises
     ------
@@ -116,7 +134,7 @@ def krylov_basis(matvec: Operator, start: ArrayLike, dim: int) -> tuple[Tensor, 
     vector = as_vector("krylov_basis: start", start)
     size = min(vector.numel(), COUNT("krylov_basis: dim", dim))
     space = KrylovSpace(CountedOperator("krylov_basis: matvec", matvec), vector, _BREAKDOWN)
-    chain = space.open(vector)
+    chain = space.start_chain(vector)
     images: list[Tensor] = []
     for _ in range(size):
         image = space.extend(chain)
@@ -137,24 +155,24 @@ def leftmost_eigenvalues(
 ) -> Tensor:
     """Return the k leftmost eigenvalues of a symmetric A, ascending, from products alone.
 
-    Lanczos with full reorthogonalisation from a random start, until the Ritz pairs (θ, v) have
-    ‖Av - θv‖ ≤ 1e-8 ‖A‖: an eigenvalue lies as near to θ. Where the chain has spanned all that
-    its start can see, another start finds more, such as repeated eigenvalues; a repeated one may
-    be returned once where the chain goes on beyond it.
+    Lanczos with full reorthogonalisation runs from a random start until k Ritz pairs (θ, v) satisfy
+    ‖Av - θv‖ ≤ 1e-8 ‖A‖. An eigenvalue is then within 1e-8 ‖A‖ of each θ. After a breakdown
+    another random start continues, and finds further copies of repeated eigenvalues. Without a
+    breakdown a repeated eigenvalue may be returned once only.
 
     Parameters
     ----------
     matvec
         v ↦ Av, float64 Tensor[d] to Tensor[d].
     like
-        A vector of A's size and device, [d].
+        A vector with the size and device of v, [d].
     k
-        Eigenvalues wanted, 1 to d.
+        Number of eigenvalues, 1 to d.
     max_products
-        Most products spent, at least k; None: min(d, 1000). Memory: 8·d bytes a product. Where they
-        run out, a warning says so, and the last values are bounds from above.
+        Maximum number of products, at least k. None: min(d, 1000). Memory: 8·d bytes a product.
+        Without convergence the Ritz values are upper bounds, and a RuntimeWarning says so.
     seed
-        Of the random starts; the global generator is not touched.
+        Seed of the random starts. PyTorch's global generator is not used.
 
     Returns
     -------
@@ -170,15 +188,15 @@ def leftmost_eigenvalues(
     name = "leftmost_eigenvalues"
     vector = as_vector(f"{name}: like", like)
     k = integer(1, vector.numel())(f"{name}: k", k)
-    limit = min(vector.numel(), _MAX_PRODUCTS) if max_products is None else max_products
+    limit = min(vector.numel(), MAX_PRODUCTS) if max_products is None else max_products
     limit = min(vector.numel(), integer(k)(f"{name}: max_products", limit))
     seed = SEED(f"{name}: seed", seed)
     space = KrylovSpace(CountedOperator(f"{name}: matvec", matvec), vector, _BREAKDOWN)
-    chain = space.open(random_unit_vector(vector, seed))
+    chain = space.start_chain(random_unit_vector(vector, seed))
     while True:
-        for _ in range(1 + space.size // 16):  # the projected problem is O(k³), see krylov.py
+        for _ in range(1 + space.size // SOLVE_INTERVAL):
             if space.size < limit and space.extend(chain) is None:
-                chain = space.open(random_unit_vector(vector, seed + len(space.chains)))
+                chain = space.start_chain(random_unit_vector(vector, seed + len(space.chains)))
         values, error = _ritz(space, k)
         if len(values) == k and error <= _TOLERANCE * space.norm:
             return values
@@ -194,11 +212,7 @@ def leftmost_eigenvalues(
 
 
 def _ritz(space: KrylovSpace, k: int) -> tuple[Tensor, float]:
-    """Return the leftmost Ritz values, at most k of them, and the largest of their residuals."""
+    """Return at most k leftmost Ritz values and the largest of their residual norms."""
     values, vectors = np.linalg.eigh(space.projected)
-    residuals = torch.zeros(space.dim, min(k, len(values)), dtype=torch.float64)
-    for chain, end in zip(space.chains, space.ends, strict=True):
-        if end is not None and chain:
-            residuals += torch.outer(end.cpu(), torch.from_numpy(vectors[chain[-1], :k]))
-    error = float(torch.linalg.vector_norm(residuals, dim=0).max())
-    return torch.from_numpy(values[:k]), error
+    norms = [float(torch.linalg.vector_norm(space.residual(y))) for y in vectors.T[:k]]
+    return torch.from_numpy(values[:k]), max(norms)

@@ -7,15 +7,15 @@ import numpy as np
 
 from sb3_crpn.arrays import FloatArray
 
-# Measured on 40 000 generated problems: 2.0 in the mean, more than 7 in 0.1 %, at most 11
+# 40 000 random problems took 2.0 iterations in the mean, more than 7 in 0.1 %, and at most 11
 _MAX_ITERATIONS = 50
 
-# Convergence is quadratic: after a relative step of 1e-8 the error is rounding
+# Convergence is quadratic. After a relative step of 1e-8 only rounding errors are left
 _LAST_STEP = 1e-8
 
 
 class SecularSolution(NamedTuple):
-    """Global minimiser y [k], the decrease -m(y) ≥ 0 and the iterations that it took."""
+    """Global minimiser y [k], the decrease -m(y) ≥ 0 and the number of iterations."""
 
     coordinates: FloatArray
     decrease: float
@@ -27,18 +27,19 @@ def solve_secular(eigenvalues: FloatArray, gamma: FloatArray, alpha: float) -> S
 
     .. math:: \min_y\; \gamma \cdot y + \tfrac12 \sum_i \lambda_i y_i^2 + \tfrac\alpha6 \|y\|^3
 
-    The minimiser is y = -γ/(λ_i + λ) with λ = ρ‖y‖, ρ = α/2 and λ ≥ λ̄ = max(0, -λ_1): the secular
-    equation. Its unknown is μ = λ - λ̄ ≥ 0, the distance from the pole; λ itself would lose the
-    digits of a nearly hard case. In the hard case (γ vanishes on the leftmost eigenspace and what
-    is left is too short) μ = 0 and the leftmost eigenvector makes up the length.
+    The minimiser is y_i = -γ_i/(λ_i + λ). The multiplier λ ≥ λ̄ = max(0, -λ_1) solves the secular
+    equation ‖y(λ)‖ = λ/ρ, ρ = α/2. Its unknown is μ = λ - λ̄ ≥ 0, the distance from the pole, since
+    λ itself has too few digits in a nearly hard case. In the hard case γ vanishes on the leftmost
+    eigenspace and ‖y(λ̄)‖ < λ̄/ρ. Then μ = 0, and a multiple of the leftmost eigenvector makes
+    ‖y‖ = λ̄/ρ.
 
-    Units are chosen so that ρ = 1 and all numbers are O(1): with c = max(‖λ‖_∞, √(ρ‖γ‖)),
-    eigenvalues are measured in c, γ in c²/ρ, y in c/ρ.
+    Units make ρ = 1 and all numbers O(1). With c = max(‖λ‖_∞, √(ρ‖γ‖)), the unit of eigenvalues is
+    c, that of γ is c²/ρ, and that of y is c/ρ.
 
     Parameters
     ----------
     eigenvalues
-        λ_i, ascending, array[k]; k = 0 is allowed.
+        λ_i, ascending, array[k], k ≥ 0.
     gamma
         γ, the gradient's coordinates, array[k].
     alpha
@@ -54,30 +55,30 @@ def solve_secular(eigenvalues: FloatArray, gamma: FloatArray, alpha: float) -> S
     shift = max(0.0, -float(eigenvalues[0]) / unit)
     a = eigenvalues / unit + shift
 
-    mu, iterations = _root(a, w, shift)
-    y = -_quotient(w, a + mu)
+    mu, iterations = _secular_root(a, w, shift)
+    y = -_divide(w, a + mu)
     if mu == 0:
         y[0] += _hard_case_length(_norm(y), shift)
-    # at a stationary point -m(y) = -½ γ·y + (ρ/6)‖y‖³: two terms ≥ 0, no cancellation
+    # at a stationary point -m(y) = -½ γ·y + (ρ/6)‖y‖³. Both terms are ≥ 0, so nothing cancels
     decrease = unit * (unit / rho) ** 2 * (_norm(y) ** 3 / 6 - float(w @ y) / 2)
     return SecularSolution(y * (unit / rho), decrease, iterations)
 
 
-def _root(a: FloatArray, w: FloatArray, shift: float) -> tuple[float, int]:
-    """Solve ``‖w/(a + μ)‖ = μ + shift`` for μ ≥ 0; 0 if the left side is smaller there.
+def _secular_root(a: FloatArray, w: FloatArray, shift: float) -> tuple[float, int]:
+    """Solve ``‖w/(a + μ)‖ = μ + shift`` for μ ≥ 0. Return 0 if the left side is smaller at μ = 0.
 
-    1/‖s‖ is linearised and 1/λ kept exact: with n = ‖z‖, z = w/(a + μ), λ = μ + shift and
-    p = Σ(z_i/n)²/(a_i + μ), the step δ solves (1 + pδ)(λ + δ) = n. As 1/‖s‖ is concave in μ, the
-    iterates grow monotonically towards the root from any lower bound: the first that is not
-    below it is it, to rounding.
+    An iteration linearises 1/‖s‖ and keeps 1/λ exact. With z = w/(a + μ), n = ‖z‖, λ = μ + shift
+    and p = Σ(z_i/n)²/(a_i + μ), its step δ solves (1 + pδ)(λ + δ) = n. 1/‖s‖ is concave in μ.
+    Iterates from a lower bound therefore increase monotonically to the root. The first iterate at
+    which the left side is not larger is the root up to rounding.
     """
     mu = _lower_bound(a, w, shift)
     for iteration in range(_MAX_ITERATIONS):
-        z = _quotient(w, a + mu)
+        z = _divide(w, a + mu)
         n, lam = _norm(z), mu + shift
         if n <= lam:
             return mu, iteration
-        p = float(np.sum(_quotient((z / n) ** 2, a + mu)))
+        p = float(np.sum(_divide((z / n) ** 2, a + mu)))
         b = 1 + p * lam
         excess = (n - lam) / b
         delta = 2 * excess / (1 + math.sqrt(1 + 4 * (p / b) * excess))
@@ -88,25 +89,25 @@ def _root(a: FloatArray, w: FloatArray, shift: float) -> tuple[float, int]:
 
 
 def _lower_bound(a: FloatArray, w: FloatArray, shift: float) -> float:
-    """Return the largest root of the single equations ``(a_i + μ)(shift + μ) = |w_i|``, or 0."""
+    """Return the largest root μ ≥ 0 of the scalar equations ``(a_i + μ)(shift + μ) = |w_i|``."""
     size = np.abs(w)
     discriminant = np.sqrt((a - shift) ** 2 + 4 * size)
-    roots = _quotient(2 * np.maximum(size - a * shift, 0), a + shift + discriminant)
+    roots = _divide(2 * np.maximum(size - a * shift, 0), a + shift + discriminant)
     return float(np.max(roots))
 
 
 def _hard_case_length(length: float, shift: float) -> float:
-    """Return τ with ``length² + τ² = shift²``: how far to go along the leftmost eigenvector."""
+    """Return τ ≥ 0 with ``length² + τ² = shift²``, the component on the leftmost eigenvector."""
     return math.sqrt(max(0.0, (shift - length) * (shift + length)))
 
 
-def _quotient(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
-    """Divide, with 0/0 = 0: a direction without gradient takes no part."""
+def _divide(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
+    """Divide with 0/0 = 0. A direction without gradient has no component in the minimiser."""
     out: FloatArray = np.zeros_like(numerator)
     return np.divide(numerator, denominator, out=out, where=numerator != 0)
 
 
 def _norm(x: FloatArray) -> float:
-    """Euclidean norm without overflow or underflow of the squares."""
+    """Return the Euclidean norm without overflow or underflow of the squares."""
     largest = float(np.max(np.abs(x), initial=0.0))
     return largest * float(np.linalg.norm(x / largest)) if largest > 0 else 0.0

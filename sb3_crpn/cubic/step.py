@@ -1,4 +1,4 @@
-"""What a cubic solver takes and returns: counted products, `CubicStep`."""
+"""The input and the result of a cubic solver: `CountedOperator` and `CubicStep`."""
 
 import math
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ ROUNDING = 10.0
 
 @dataclass(frozen=True, eq=False)
 class CubicStep:
-    r"""A minimiser of the cubic model, exact or approximate, and what is known about it.
+    r"""A minimiser of the cubic model, exact or approximate, with its optimality conditions.
 
     .. math:: m(s) = g \cdot s + \tfrac12 s^T H s + \tfrac{\alpha}{6} \|s\|_M^3
 
@@ -41,12 +41,12 @@ class CubicStep:
     certified
         True only if both optimality conditions were verified to tolerance.
     status
-        How the solver ended, for people.
+        Why the solver stopped, as text.
     lambda_min
-        Leftmost (Ritz) value of H, relative to M, that the solver saw; NaN if it saw none.
+        Leftmost eigenvalue or Ritz value of H, relative to M. NaN if the solver computes none.
     at_sosp
-        Whether the model allows so small a decrease that the origin is an ε-second-order stationary
-        point: the early termination of Maniyar et al., Algorithm 2. Other solvers leave it False.
+        Whether the predicted decrease is below the threshold of Maniyar et al., Algorithm 2, at
+        which the origin is an ε-second-order stationary point. Exact solvers leave it False.
     """
 
     step: Tensor
@@ -70,12 +70,12 @@ class CubicStep:
 
 
 class CountedOperator:
-    """A user's ``v ↦ Hv`` that counts its calls and answers in v's dtype, on v's device.
+    """A user's ``v ↦ Hv``. It counts its calls and returns Hv with v's dtype and device.
 
     Raises
     ------
     ValueError
-        If it is not callable, or a product has another shape than v or is not finite.
+        The operator is not callable, or Hv has another shape than v or is not finite.
     """
 
     def __init__(self, name: str, operator: Operator) -> None:
@@ -100,13 +100,15 @@ class CountedOperator:
         return product
 
 
-def residual_limit(tol: float, gradient_norm: float, curvature: float, step_norm: float) -> float:
-    """Return the largest residual that counts as zero; ``curvature`` is ‖H‖ + λ‖M‖ (DESIGN §4)."""
+def residual_tolerance(
+    tol: float, gradient_norm: float, curvature: float, step_norm: float
+) -> float:
+    """Return max(tol‖g‖, 10·eps·(‖H‖ + λ‖M‖)‖s‖) (DESIGN §4); ``curvature`` is ‖H‖ + λ‖M‖."""
     return max(tol * gradient_norm, ROUNDING * EPS * curvature * step_norm)
 
 
 def random_unit_vector(like: Tensor, seed: int) -> Tensor:
-    """Draw uniformly from the unit sphere of R^d, d, dtype and device as ``like``."""
+    """Draw uniformly from the unit sphere of R^d, with the size, dtype and device of ``like``."""
     generator = torch.Generator().manual_seed(seed)
     vector = torch.randn(like.numel(), generator=generator, dtype=like.dtype).to(like.device)
     return vector / float(torch.linalg.vector_norm(vector))

@@ -1,4 +1,4 @@
-"""Second-order stationarity made visible: certificate, report, callback."""
+"""Second-order stationarity: certificate, report, callback."""
 
 from sb3_crpn.sosp.callback import SospCallback
 from sb3_crpn.sosp.certificate import certify_sosp

@@ -1,4 +1,4 @@
-"""Independent estimates of ∇J and ∇²J from blocks of whole episodes."""
+"""Batch means: independent estimates of ∇J and ∇²J from blocks of whole episodes."""
 
 from __future__ import annotations
 
@@ -20,16 +20,17 @@ from sb3_crpn.sosp.model_covariance import model_covariance
 # The causal estimator at κ = 1: unbiased (DESIGN section 2)
 UNBIASED = Causal(1.0)
 
-# Up to this d every block's Hessian is written out: d products with each, fewer than the directions
-# and the limits would otherwise take
-DENSE = 16
+# Up to this d every block's Hessian is a matrix. Its d products are fewer than Lanczos and the
+# interval limits take
+_MAX_DENSE_SIZE = 16
 
 
 @dataclass(frozen=True)
 class BatchMeans:
     """K independent and identically distributed pairs (g_k, H_k) with means ∇J and ∇²J.
 
-    Block k belongs to half k mod 2; K is even. Ĥ and ĝ are the means over all blocks.
+    K is even. Fold 0 holds the even blocks, fold 1 the odd ones. ĝ and Ĥ are the means over all
+    blocks.
 
     Attributes
     ----------
@@ -37,26 +38,26 @@ class BatchMeans:
         g_k, float64 [K, d].
     block_products
         X ↦ (H_k x_k)_k, [K, d] to [K, d].
-    half_products
-        v ↦ the mean of H_k v over each half, [d] to [d].
+    fold_products
+        v ↦ the mean of H_k v over each fold, [d] to [d].
     model_covariance_product
-        v ↦ Bv, the covariance of g_k that the policy's probabilities imply, [d] to [d].
+        v ↦ Bv, B the model-based covariance of g_k, [d] to [d].
     """
 
     gradients: Tensor
     block_products: Operator
-    half_products: tuple[Operator, Operator]
+    fold_products: tuple[Operator, Operator]
     model_covariance_product: Operator
 
     @classmethod
-    def from_matrices(cls, gradients: Tensor, hessians: Tensor, implied: Tensor) -> BatchMeans:
-        """Return the sample of known g_k [K, d], symmetric H_k [K, d, d] and B [d, d]."""
+    def from_matrices(cls, gradients: Tensor, hessians: Tensor, covariance: Tensor) -> BatchMeans:
+        """Return the batch means with g_k [K, d], symmetric H_k [K, d, d] and B [d, d]."""
         even, odd = hessians[0::2].mean(0), hessians[1::2].mean(0)
         return cls(
             gradients,
             lambda vectors: torch.einsum("kij,kj->ki", hessians, vectors),
             (lambda vector: even @ vector, lambda vector: odd @ vector),
-            lambda vector: implied @ vector,
+            lambda vector: covariance @ vector,
         )
 
     @classmethod
@@ -69,10 +70,10 @@ class BatchMeans:
         gamma: float,
         rng: np.random.Generator,
     ) -> BatchMeans:
-        """Deal the episodes at random into ``n_blocks`` blocks of equally many.
+        """Split the episodes at random into ``n_blocks`` blocks of equal size.
 
-        At random, because episodes come in the order in which they ended, which tells of their
-        lengths.
+        The order of the batch is that in which episodes ended, and depends on their lengths. A
+        random permutation makes the blocks identically distributed.
         """
         batch = batch.take(rng.permutation(batch.n_episodes))
         blocks = [
@@ -87,32 +88,34 @@ class BatchMeans:
             (even.hessian_product, odd.hessian_product),
             model_covariance(policy, actor, batch, n_blocks, gamma),
         )
-        return sample.to_dense() if sample.size <= DENSE else sample
+        return sample.to_dense() if sample.size <= _MAX_DENSE_SIZE else sample
 
     def to_dense(self) -> BatchMeans:
-        """Return the same sample with its Hessians as matrices."""
+        """Return the same batch means with H_k and B as matrices."""
         identity = torch.eye(self.size, dtype=torch.float64, device=self.gradients.device)
         hessians = torch.stack([self.products(column) for column in identity], dim=2)
-        implied = torch.stack([self.model_covariance_product(column) for column in identity], dim=1)
+        covariance = [self.model_covariance_product(column) for column in identity]
         return self.from_matrices(
-            self.gradients, 0.5 * (hessians + hessians.transpose(1, 2)), implied
+            self.gradients,
+            0.5 * (hessians + hessians.transpose(1, 2)),
+            torch.stack(covariance, dim=1),
         )
 
-    def with_ticks(self, tick: Tick) -> BatchMeans:
-        """Return the same sample, which tells of each product with the Hessian of its episodes."""
+    def with_progress(self, tick: Tick) -> BatchMeans:
+        """Return the same batch means. ``tick`` is called at each product with a Hessian."""
 
-        def ticking(operator: Operator) -> Operator:
+        def counted(operator: Operator) -> Operator:
             def product(vector: Tensor) -> Tensor:
                 tick(1)
                 return operator(vector)
 
             return product
 
-        even, odd = self.half_products
+        even, odd = self.fold_products
         return replace(
             self,
-            block_products=ticking(self.block_products),
-            half_products=(ticking(even), ticking(odd)),
+            block_products=counted(self.block_products),
+            fold_products=(counted(even), counted(odd)),
         )
 
     @property
@@ -131,12 +134,12 @@ class BatchMeans:
 
     def mean_product(self, vector: Tensor) -> Tensor:
         """Return Ĥv, [d]."""
-        return 0.5 * (self.half_products[0](vector) + self.half_products[1](vector))
+        return 0.5 * (self.fold_products[0](vector) + self.fold_products[1](vector))
 
     def moment_products(self, vector: Tensor) -> tuple[Tensor, Tensor]:
-        """Return Ĥv and V̂v, V̂ = Σ_k (H_k - Ĥ)² / (K - 1), at the cost of two products, [d] each.
+        """Return Ĥv and V̂v, V̂ = Σ_k (H_k - Ĥ)² / (K - 1), from two products, [d] each.
 
-        (H_k - Ĥ)v is multiplied by H_k alone: Ĥ times the sum of these is zero.
+        Σ_k Ĥ(H_k - Ĥ)v = 0, hence (K - 1)V̂v = Σ_k H_k(H_k - Ĥ)v.
         """
         products = self.products(vector)
         mean = products.mean(0)

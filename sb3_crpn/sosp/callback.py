@@ -17,26 +17,26 @@ from sb3_crpn.sosp.target import ENVIRONMENT
 
 
 class SospCallback(BaseCallback):
-    """Certify the policy every ``eval_freq`` calls, and log what comes of it.
+    """Certify the policy every ``eval_freq`` calls and log the verdict, for any on-policy model.
 
-    Logs ``sosp/gradient_norm``, ``sosp/lambda_min`` and ``sosp/verdict``, for any SB3 on-policy
-    model. Training goes on as without it: episodes are simulated in an environment of their own,
-    and policy and random generators are left as they were.
+    Logs ``sosp/gradient_norm``, ``sosp/lambda_min`` and ``sosp/verdict``. The callback does not
+    change training. It simulates episodes in a separate environment, and restores the policy's
+    state and the random generators.
 
     Parameters
     ----------
     eval_freq
-        Calls between certificates; a call is one step of all training environments.
+        Calls between certificates. A call is one step of all training environments.
     eval_env
-        Environment to simulate in, wrapped as the training environment is. The statistics of a
-        ``VecNormalize`` are copied over, as ``EvalCallback`` does.
+        Environment of the certificates, wrapped like the training environment. The statistics of a
+        ``VecNormalize`` are copied to it, as in ``EvalCallback``.
     n_episodes, epsilon, rho
-        As in :func:`certify_sosp`. With ``None`` each certificate has thresholds of its own policy:
-        give both to compare certificates along training.
+        As in :func:`certify_sosp`. ``None`` chooses thresholds anew for each policy. Certificates
+        along training are comparable only if both ε and ρ are given.
     stop_at_sosp
         End training at the first verdict "sosp".
     seed
-        Of all certificates together.
+        Seed of the sequence of certificates.
     verbose
         1: print each report.
     **options
@@ -47,12 +47,12 @@ class SospCallback(BaseCallback):
     ValueError
         An argument is out of range.
     TypeError
-        :func:`certify_sosp` has no such option.
+        An option is no argument of :func:`certify_sosp`.
 
     Attributes
     ----------
     report
-        The last :class:`SospReport`, ``None`` before the first.
+        The latest :class:`SospReport`. ``None`` before the first.
     """
 
     def __init__(
@@ -101,6 +101,6 @@ class SospCallback(BaseCallback):
         self.logger.record("sosp/gradient_norm", report.gradient_norm.estimate)
         self.logger.record("sosp/lambda_min", report.lambda_min.estimate)
         self.logger.record("sosp/verdict", report.verdict)
-        # dumped at once, as EvalCallback does, for the timestep to be right
+        # written at once, as in EvalCallback, so that the timestep is that of the certificate
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)

@@ -36,10 +36,10 @@ from sb3_crpn.sosp.inference import Interval, bernstein_intervals, bootstrap_int
 from sb3_crpn.sosp.report import IntervalMethod, SospReport
 from sb3_crpn.sosp.spectrum import Spectrum, lanczos_spectrum
 from sb3_crpn.sosp.target import environment_of, paper_alpha, policy_of
-from sb3_crpn.sosp.thresholds import TaskScales, choose_thresholds, likely_norm
+from sb3_crpn.sosp.thresholds import TaskScales, choose_thresholds, debiased_norm
 
-# Blocks that the noise is measured by: t_{49} is within 4 % of the normal quantile, and products
-# with 50 blocks cost about twice those with the whole batch at 500 steps a block
+# Maximum K of the batch means. t_{49} is within 4 % of the normal quantile. At 500 steps a block,
+# products with 50 blocks cost about twice those with the whole batch
 MAX_BLOCKS = 50
 
 _CHECKS: dict[str, Check] = {
@@ -77,64 +77,67 @@ def certify_sosp(
     .. math:: \|\nabla J(\theta)\| \le \varepsilon, \qquad
               \lambda_{\min}(\nabla^2 J(\theta)) \ge -\sqrt{\rho\varepsilon}
 
-    (Maniyar et al., AISTATS 2024), J(θ) = -E[Σ_h γ^h r_h] the cost of the stochastic policy π_θ.
+    (Maniyar et al., AISTATS 2024, Definition 1), J(θ) = -E[Σ_h γ^h r_h] the cost of the stochastic
+    policy π_θ.
 
-    The estimates are unbiased whatever the model was trained with: costs-to-go of whole episodes
-    with γ^i kept, nothing bootstrapped or normalised, the causal Hessian at κ = 1 (DESIGN section
-    2). The model's critic, fitted on earlier episodes, is the baseline. A time limit ends an
-    episode, and so does the ``horizon`` of a model that has one. Rewards are those that the
-    environment returns, scaled where a ``VecNormalize`` scales them.
+    The estimates are unbiased for every training setting of the model. They use costs-to-go of
+    whole episodes with the factor γ^i, without bootstrap or normalisation, and the causal Hessian
+    at κ = 1 (DESIGN section 2). The baseline is the model's critic, which was fitted on earlier
+    episodes. An episode ends at a time limit, and at the model's ``horizon`` if it has one. Rewards
+    are those of the environment, scaled by its ``VecNormalize`` if it has one.
 
-    Works on products with Hessians alone. The policy, its generators and its mode are left as they
-    were. Be prepared for "undecided": 57 % of 640 verdicts in this project's experiments, from 20
-    to 2,000 episodes. The report says about how many episodes would decide.
+    The computation uses Hessian-vector products only. It restores the policy, its mode and the
+    random generators. The verdict is often "undecided": 57 % of 640 verdicts in this project's
+    experiments, from 20 to 2,000 episodes. The report estimates how many episodes would decide.
 
     Parameters
     ----------
     model
         PPO, A2C, TRPO, CRPN, ACRPN or any other SB3 on-policy model with an ``ActorCriticPolicy``.
     n_episodes
-        Episodes to simulate, at least 4; rounded up so that at most 50 blocks hold equally many.
+        Number of episodes, at least 4. It is rounded up to a multiple of the number of blocks,
+        which is even and at most 50.
     epsilon
-        ε > 0, in the units of ∇J. ``None``: a slope that changes the return by a tenth of its size
-        over a step that changes the distribution of episodes by a KL divergence of ½. See
-        :mod:`~sb3_crpn.sosp.thresholds`.
+        ε > 0, in the units of ∇J. ``None``: the gradient norm that changes the return by a tenth of
+        its root mean square over a step of KL divergence ½ between the distributions of episodes.
+        See :mod:`~sb3_crpn.sosp.thresholds`.
     rho
-        ρ > 0, a Lipschitz constant of ∇²J. ``None``: the current α of a model whose cubic term is
-        the paper's, with α in the place of ρ (Euclidean metric, ``target_kl=None``). For others
-        the ρ with which the curvature -√(ρε) changes the return over that step by as much as the
-        slope ε. The intervals depend on neither ε nor ρ: the confidence is that of the intervals
-        however the two were chosen, be it from these episodes.
+        ρ > 0, a Lipschitz constant of ∇²J. ``None``: the current α of a model with the paper's
+        cubic term (Euclidean metric, ``target_kl=None``). For other models the ρ at which the
+        curvature -√(ρε) changes the return over that step as much as the slope ε does. The
+        intervals do not depend on ε and ρ. Their confidence therefore holds for every choice of the
+        two, also for a choice from the same episodes.
     env
-        Where to simulate; reset at the start. ``None``: the model's own, which is not possible in
-        the middle of a rollout, and which the next ``learn`` resets.
+        Environment of the episodes. It is reset at the start. ``None``: the model's own
+        environment, which the next ``learn`` then resets. Not available in mid-rollout.
     confidence
-        1 - δ: both intervals hold, and so no verdict is wrong, with at least this probability.
+        1 - δ. Both intervals cover the truth, and no verdict is wrong, with at least this
+        probability.
     interval
-        "bootstrap": from the spread over blocks of whole episodes; see
-        :mod:`~sb3_crpn.sosp.inference`. Approximate for finitely many episodes: what no episode
-        shows, a rare catastrophe or reward, no interval allows for. "bernstein": the paper's
-        matrix Bernstein bound with ``bounds``, valid for any number of episodes and far wider; the
-        estimates are then without baseline, as those that the bounds hold for.
+        "bootstrap": from the batch means of whole episodes, see :mod:`~sb3_crpn.sosp.inference`.
+        Its coverage is asymptotic: events that occur in no episode, such as rare rewards, are not
+        accounted for. "bernstein": the paper's matrix Bernstein bound with ``bounds``. It holds for
+        any number of episodes and is far wider. The estimates then have no baseline, as ``bounds``
+        requires.
     bounds
-        M_1 and M_2, largest deviations of one episode's estimates from ∇J and, in the spectral
-        norm, from ∇²J: those of :class:`sb3_crpn.theory.Constants`. For "bernstein" alone.
+        M_1 and M_2, the largest deviations of one episode's estimates from ∇J and, in the spectral
+        norm, from ∇²J: those of :class:`sb3_crpn.theory.Constants`. For "bernstein" only.
     n_eigenvalues
-        Leftmost eigenvalues to report.
+        Number of leftmost eigenvalues in the report.
     n_probes
-        Random starts of the spectral density.
+        Number of random starts of the spectral density.
     seed
-        Of actions, blocks and resamples; ``None``: fresh entropy.
+        Seed of actions, blocks and resamples. ``None``: fresh entropy.
     progress_bar
-        Show the episodes simulated and the Hessian products done; needs tqdm and rich.
+        Show the progress of episodes and of Hessian-vector products. Needs tqdm and rich.
 
     Raises
     ------
     ValueError
-        An argument is out of range, the environment's spaces are not the model's, or no episode
-        ends.
+        An argument is out of range, the environment's spaces differ from the model's, or no
+        episode ends.
     RuntimeError
-        ``env=None`` in the middle of a rollout.
+        ``env=None`` in mid-rollout.
     ImportError
         ``progress_bar=True`` without tqdm and rich.
     """
@@ -153,7 +156,7 @@ def certify_sosp(
     )
     policy, target = policy_of(model), environment_of(model, env)
     rng = np.random.default_rng(options["seed"])
-    n_blocks, n_episodes = _blocks(options["n_episodes"])
+    n_blocks, n_episodes = _block_counts(options["n_episodes"])
     with preserve_state(policy, target, int(rng.integers(2**31))):
         batch = _simulate(model, policy, target, n_episodes, options)
         actor = _actor(policy, batch)
@@ -173,9 +176,9 @@ def certify_sosp(
         interval=options["interval"],
         n_episodes=n_episodes,
         n_steps=batch.n_steps,
-        likely_gradient_norm=likely_norm(sample.gradients),
+        debiased_gradient_norm=debiased_norm(sample.gradients),
         gradient=gradient,
-        escape_direction=_downhill(gradient, spectrum.vector),
+        escape_direction=_descent_direction(gradient, spectrum.vector),
         spectrum=spectrum,
     )
 
@@ -187,7 +190,7 @@ def _simulate(
     n_episodes: int,
     options: dict[str, Any],
 ) -> EpisodeBatch:
-    """Return episodes end to end, with the model's critic as baseline for "bootstrap"."""
+    """Return whole episodes, with the model's critic as baseline for "bootstrap"."""
     horizon = getattr(model, "horizon", None)
     with progress("episodes", n_episodes, show=options["progress_bar"]) as tick:
         batch = collect_episodes(
@@ -205,7 +208,7 @@ def _infer(
     confidence, bounds = options["confidence"], options["bounds"]
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
     with progress("Hessian products", None, show=options["progress_bar"]) as tick:
-        sample = sample.with_ticks(tick)
+        sample = sample.with_progress(tick)
         spectrum = lanczos_spectrum(
             sample.mean_product,
             sample.gradients[0],
@@ -215,7 +218,7 @@ def _infer(
         )
         if bounds is None:
             intervals = bootstrap_intervals(sample, spectrum, confidence, generator, rng)
-        else:  # of "bernstein", by checked_options
+        else:  # checked_options allows bounds for "bernstein" only
             intervals = bernstein_intervals(sample, spectrum, confidence, bounds, n_episodes)
     return spectrum, intervals
 
@@ -225,19 +228,19 @@ def _actor(policy: ActorCriticPolicy, batch: EpisodeBatch) -> ActorParameters:
     return find_actor(policy, first)
 
 
-def _downhill(gradient: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
+def _descent_direction(gradient: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
     return -direction if gradient @ direction > 0.0 else direction
 
 
-def _blocks(n_episodes: int) -> tuple[int, int]:
-    """Return an even number of blocks, and the episodes that fill them evenly."""
+def _block_counts(n_episodes: int) -> tuple[int, int]:
+    """Return an even number of blocks, and ``n_episodes`` rounded up to a multiple of it."""
     per_block = math.ceil(n_episodes / MAX_BLOCKS)
     n_blocks = 2 * math.ceil(n_episodes / (2 * per_block))
     return n_blocks, n_blocks * per_block
 
 
 def checked_options(owner: str, **options: Any) -> dict[str, Any]:
-    """Return what :func:`certify_sosp` is told but the model and its environment, checked.
+    """Check the arguments of :func:`certify_sosp` other than ``model`` and ``env``.
 
     Parameters
     ----------
@@ -247,9 +250,9 @@ def checked_options(owner: str, **options: Any) -> dict[str, Any]:
     Raises
     ------
     TypeError
-        An option does not exist.
+        An option is no argument of :func:`certify_sosp`.
     ValueError
-        One is out of range.
+        An option is out of range.
     """
     for name, value in options.items():
         if name not in _CHECKS:

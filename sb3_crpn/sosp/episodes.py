@@ -1,4 +1,4 @@
-"""Whole episodes of any SB3 actor-critic policy, which is left exactly as it was."""
+"""Whole episodes of any SB3 actor-critic policy, without a change of the policy's state."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from sb3_crpn.progress import Tick
 
 @contextmanager
 def preserve_state(policy: ActorCriticPolicy, env: VecEnv, seed: int) -> Iterator[None]:
-    """Put ``policy`` in evaluation mode on a random stream of its own, then undo all of it.
+    """Put ``policy`` in evaluation mode with its own random stream, and restore the state.
 
-    Kept are the mode, the action distribution (SB3's policies reuse one object; with gSDE it holds
-    the exploration noise of the rollout in progress), PyTorch's generators, and whether a
-    ``VecNormalize`` learns its statistics.
+    The state is the policy's mode, its action distribution, PyTorch's generators, and the
+    ``training`` flag of a ``VecNormalize``. SB3's policies reuse one distribution object. With gSDE
+    it holds the exploration noise of the rollout in progress.
     """
     training, distribution = policy.training, dict(vars(policy.action_dist))
     normalizer = unwrap_vec_normalize(env)
@@ -62,29 +62,29 @@ def collect_episodes(
 ) -> EpisodeBatch:
     """Simulate whole episodes of the stochastic policy, a fixed quota from each environment.
 
-    The weights are the costs-to-go, A_i = Ψ_i = -Σ_{h≥i} γ^h r_h: no estimate enters them. A time
-    limit is an episode's end.
+    The cost advantages are the costs-to-go, A_i = Ψ_i = -Σ_{h≥i} γ^h r_h, without an estimate of
+    the critic. A time limit ends an episode.
 
     Parameters
     ----------
     policy
-        In evaluation mode; its actions are drawn from PyTorch's generator. With gSDE the noise is
-        drawn anew for each step, as π(a|s) has it.
+        In evaluation mode. Actions are drawn from PyTorch's generator. With gSDE the noise is drawn
+        anew at each step, so that the actions are independent samples of π(a|s).
     env
         Reset at the start.
     n_episodes
-        Episodes in all.
+        Number of episodes of all environments together.
     gamma
         γ.
     horizon
-        Steps after which an episode is cut; ``None``: never.
+        Maximum length of an episode in steps. ``None``: no limit.
     tick
-        Told of each episode that has ended.
+        Called at the end of each episode.
 
     Raises
     ------
     ValueError
-        A reward is not finite, or no episode comes to an end.
+        A reward is not finite, or no episode ends.
     """
     collector = Collector(
         policy, env, bootstrap_truncated=False, uses_critic=False, sde_sample_freq=1
@@ -99,8 +99,7 @@ def collect_episodes(
 def with_baseline(policy: ActorCriticPolicy, batch: EpisodeBatch, gamma: float) -> EpisodeBatch:
     """Return the batch with A_i = Ψ_i + γ^i V(s_i).
 
-    Unbiased for the gradient and the Hessian, since V, whatever it is, was fitted on other
-    episodes than these (DESIGN section 2).
+    Gradient and Hessian stay unbiased, since V was fitted on other episodes (DESIGN section 2).
     """
     with torch.no_grad():
         values = state_values(policy, batch.observations).cpu().double().numpy()
@@ -114,7 +113,7 @@ def _new_buffer(policy: ActorCriticPolicy, n_envs: int, gamma: float) -> Episode
         DictEpisodeRolloutBuffer if is_dict else EpisodeRolloutBuffer
     )
     return buffer_class(
-        256,  # grows
+        256,  # initial capacity
         policy.observation_space,
         policy.action_space,
         device=policy.device,

@@ -1,29 +1,30 @@
 r"""Confidence intervals for ‖∇J‖ and λ_min(∇²J).
 
-Both are extremes over directions of means that episodes estimate one by one,
+Both are extremes of expectations over unit directions,
 
 .. math:: \|\nabla J\| = \max_n n \cdot \nabla J, \qquad
           \lambda_{\min}(\nabla^2 J) = \min_v v^T \nabla^2 J\, v, \qquad \|n\| = \|v\| = 1,
 
-and the extreme of an estimate is biased outwards: noise makes ‖ĝ‖ too large and λ_min(Ĥ) too small.
-Each interval has one limit on that side and one on the other.
+and noise biases the extreme of an estimate outwards: ‖ĝ‖ is too large and λ_min(Ĥ) is too small.
+Each interval has an outer limit on that side and an inner limit on the other.
 
-- *Outer limit* (upper for ‖∇J‖, lower for λ_min). The true n is one fixed direction, in which the
-  one-dimensional t interval holds: n·∇J ≤ n·ĝ + τ s(n), where s(n) is the standard deviation of
-  n·g_k over the K blocks and τ = t_{K-1}/√K. Since n is not known, the limit is taken in the worst
-  direction: it covers whenever the t interval in the true one does, however large d is. For the
-  Hessian s(v)² ≤ vᵀV̂v, V̂ = Σ_k (H_k - Ĥ)²/(K - 1), bounds the variance of vᵀH_k v.
-- *Inner limit*. A direction learnt from one half of the blocks is independent of the other half,
-  where it gives a plain mean, of n·∇J ≤ ‖∇J‖ or vᵀ∇²J v ≥ λ_min. Its limit is the studentised
-  bootstrap's, which allows for skewness. Both halves have a turn, each at half the error.
+- *Outer limit* (upper for ‖∇J‖, lower for λ_min). In the fixed true direction n the one-dimensional
+  t interval holds: n·∇J ≤ n·ĝ + τ s(n). s(n) is the standard deviation of n·g_k over the K blocks,
+  and τ = t_{K-1}/√K. Since n is unknown, the limit is robust: it is the maximum of the right side
+  over all n. It covers whenever the t interval of the true direction does, for every d. For the
+  Hessian, vᵀV̂v ≥ s(v)² bounds the variance of vᵀH_k v, V̂ = Σ_k (H_k - Ĥ)²/(K - 1).
+- *Inner limit* (cross-fitting). One fold of the blocks estimates a direction. The other fold is
+  independent of it and estimates n·∇J ≤ ‖∇J‖ or vᵀ∇²J v ≥ λ_min by a mean. Its limit is that of the
+  studentised bootstrap, which allows for skewness. Each fold estimates the direction once, at half
+  the error probability.
 
-Actions that a policy seldom takes may be missing from all episodes, which then agree, on wrong
-values: a policy near to a deterministic one would look stationary. But their probabilities are
-known. The spread of g_k is therefore taken to be no smaller than these imply
-(:func:`~sb3_crpn.sosp.model_covariance.model_covariance`); that of H_k grows by the same factor,
-and beyond a factor of 2 λ_min is given no limits.
+Rare actions may be absent from all episodes. The sample variance is then too small, and a nearly
+deterministic policy seems stationary. The standard deviation of g_k is therefore at least that of
+its model-based covariance (:func:`~sb3_crpn.sosp.model_covariance.model_covariance`). The standard
+deviation of H_k is inflated by the same factor. Beyond a factor of 2 the limits of λ_min are
+infinite.
 
-The two-sided interval of "bernstein" is a ball around the estimate instead.
+The intervals of "bernstein" are balls around the estimates instead.
 """
 
 from __future__ import annotations
@@ -37,23 +38,22 @@ from scipy.stats import t as student
 
 from sb3_crpn.arrays import FloatArray
 from sb3_crpn.sosp.batch_means import BatchMeans
-from sb3_crpn.sosp.robust import worst_curvature
-from sb3_crpn.sosp.spectrum import Spectrum, lanczos_spectrum
+from sb3_crpn.sosp.robust import robust_lambda_min
+from sb3_crpn.sosp.spectrum import Spectrum, lanczos_spectrum, largest_eigenvalue
 
 N_RESAMPLES = 10_000
 
-# Lanczos steps for a half's direction, which need not be exact, and for max_n nᵀBn; on CartPole-v1,
-# 64×64, the latter had converged to six digits
-_HALF_STEPS, _NORM_STEPS = 10, 6
+# Lanczos steps for the direction of a fold, which need not be exact
+_FOLD_STEPS = 10
 
-# Nothing is said of the curvature where the gradient's implied spread is more than this times the
-# sampled one
-_UNSEEN = 2.0
+# λ_min has infinite limits where the model-based standard deviation of the gradient exceeds this
+# multiple of the sample standard deviation
+_MAX_INFLATION = 2.0
 
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate and the limits that its true value keeps with the stated confidence."""
+    """An estimate with its lower and upper confidence limits."""
 
     estimate: float
     lower: float
@@ -75,9 +75,9 @@ def bootstrap_intervals(
     generator: torch.Generator,
     rng: np.random.Generator,
 ) -> tuple[Interval, Interval]:
-    """Return the intervals of ‖∇J‖ and λ_min(∇²J) from the spread over blocks.
+    """Return the intervals of ‖∇J‖ and λ_min(∇²J) from batch means.
 
-    Each of the four limits fails with probability (1 - ``confidence``)/4.
+    Each of the four limits has the error probability (1 - ``confidence``)/4.
 
     Parameters
     ----------
@@ -88,20 +88,21 @@ def bootstrap_intervals(
     confidence
         In (0, 1).
     generator, rng
-        Of directions and of resamples.
+        Of the Lanczos starts and of the resamples.
     """
     error = (1.0 - confidence) / 4.0
-    multiplier = float(student.isf(error, sample.n_blocks - 1)) / math.sqrt(sample.n_blocks)
-    spread = float(torch.linalg.matrix_norm(sample.gradients - sample.gradients.mean(0), 2))
-    spread /= math.sqrt(sample.n_blocks - 1)
-    implied = _implied_spread(sample, generator)
-    upper = multiplier * max(spread, implied) if sample.gradients.any() else math.inf
-    of_gradient = _gradient_interval(sample, upper, error, rng)
-    if implied > _UNSEEN * spread:
+    quantile = float(student.isf(error, sample.n_blocks - 1)) / math.sqrt(sample.n_blocks)
+    std = float(torch.linalg.matrix_norm(sample.gradients - sample.gradients.mean(0), 2))
+    std /= math.sqrt(sample.n_blocks - 1)
+    variance = largest_eigenvalue(sample.model_covariance_product, sample.gradients[0], generator)
+    model_std = math.sqrt(variance)
+    radius = quantile * max(std, model_std) if sample.gradients.any() else math.inf
+    of_gradient = _gradient_interval(sample, radius, error, rng)
+    if model_std > _MAX_INFLATION * std:
         return of_gradient, Interval(float(spectrum.leftmost[0]), -math.inf, math.inf)
-    inflation = max(1.0, implied / spread) if spread > 0.0 else 1.0
+    inflation = max(1.0, model_std / std) if std > 0.0 else 1.0
     return of_gradient, _curvature_interval(
-        sample, spectrum, inflation, multiplier, error, generator, rng
+        sample, spectrum, inflation, quantile, error, generator, rng
     )
 
 
@@ -112,10 +113,10 @@ def bernstein_intervals(
     bounds: tuple[float, float],
     n_episodes: int,
 ) -> tuple[Interval, Interval]:
-    """Return balls around ‖ĝ‖ and λ_min(Ĥ), each missed with probability (1 - ``confidence``)/2.
+    """Return balls around ‖ĝ‖ and λ_min(Ĥ), each of error probability (1 - ``confidence``)/2.
 
-    |‖ĝ‖ - ‖∇J‖| ≤ ‖ĝ - ∇J‖ and |λ_min(Ĥ) - λ_min(∇²J)| ≤ ‖Ĥ - ∇²J‖ (Weyl). ``bounds`` are M_1 and
-    M_2 of one episode.
+    |‖ĝ‖ - ‖∇J‖| ≤ ‖ĝ - ∇J‖, and |λ_min(Ĥ) - λ_min(∇²J)| ≤ ‖Ĥ - ∇²J‖ by Weyl's inequality.
+    ``bounds`` are M_1 and M_2 of one episode.
     """
     error = (1.0 - confidence) / 2.0
     norm = float(torch.linalg.vector_norm(sample.gradients.mean(0)))
@@ -129,46 +130,37 @@ def bernstein_intervals(
 
 
 def bernstein_radius(bound: float, n: int, dimensions: int, error: float) -> float:
-    """Return r with P(‖mean of n - expectation‖ ≥ r) ≤ ``error``.
+    r"""Return r with P(‖mean of n terms - expectation‖ ≥ r) ≤ ``error``.
 
-    The matrix Bernstein inequality (Tropp, User-friendly tail bounds for sums of random matrices,
-    Found. Comput. Math. 12, 2012, Theorem 1.4, 1.6): for deviations of norm ≤ M, and thus variance
-    ≤ M², P ≤ D exp(-n r²/2 / (M² + Mr/3)), D = 2d for symmetric matrices and d + 1 for vectors.
-    Solved for r, without the factor 8/3 by which the paper rounds it up.
+    .. math:: P \le D \exp\Big(\frac{-n r^2/2}{M^2 + M r/3}\Big)
+
+    The matrix Bernstein inequality (Tropp, Found. Comput. Math. 12, 2012, Theorems 1.4 and 1.6) for
+    deviations of norm ≤ M, and hence variance ≤ M². D = ``dimensions`` is 2d for symmetric matrices
+    and d + 1 for vectors. The formula is solved for r, without the paper's upper bound by 8/3.
     """
     exponent = math.log(dimensions / error) / n
     return bound * (exponent / 3.0 + math.sqrt((exponent / 3.0) ** 2 + 2.0 * exponent))
 
 
-def _implied_spread(sample: BatchMeans, generator: torch.Generator) -> float:
-    """Return the largest standard deviation of n·g_k that B implies."""
-    negative = lanczos_spectrum(
-        lambda vector: -sample.model_covariance_product(vector),
-        sample.gradients[0],
-        generator,
-        n_steps=_NORM_STEPS,
-    )
-    return math.sqrt(max(0.0, -float(negative.leftmost[0])))
-
-
 def _gradient_interval(
     sample: BatchMeans, radius: float, error: float, rng: np.random.Generator
 ) -> Interval:
-    """Return the interval of ‖∇J‖ of which the upper limit is ``radius`` above ‖ĝ‖.
+    """Return the interval of ‖∇J‖ with the upper limit ‖ĝ‖ + ``radius``.
 
     max_n [n·ĝ + τ s(n)] ≤ ‖ĝ‖ + τ max_n s(n).
     """
     norm = float(torch.linalg.vector_norm(sample.gradients.mean(0)))
     lower = 0.0
-    for half in (0, 1):
-        learnt = sample.gradients[half::2].mean(0)
-        length = float(torch.linalg.vector_norm(learnt))
+    for fold in (0, 1):
+        mean = sample.gradients[fold::2].mean(0)
+        length = float(torch.linalg.vector_norm(mean))
         if length > 0.0:
-            direction = learnt / length
-            implied = float(direction @ sample.model_covariance_product(direction))
-            held_out = (sample.gradients[1 - half :: 2] @ direction).cpu().numpy()
-            spread = math.sqrt(max(0.0, implied))
-            lower = max(lower, -upper_limit(-held_out, error / 2.0, rng, least_spread=spread))
+            direction = mean / length
+            variance = float(direction @ sample.model_covariance_product(direction))
+            held_out = (sample.gradients[1 - fold :: 2] @ direction).cpu().numpy()
+            std = math.sqrt(max(0.0, variance))
+            limit = -bootstrap_upper_limit(-held_out, error / 2.0, rng, min_std=std)
+            lower = max(lower, limit)
     return Interval(norm, min(lower, norm), norm + radius)
 
 
@@ -176,47 +168,47 @@ def _curvature_interval(
     sample: BatchMeans,
     spectrum: Spectrum,
     inflation: float,
-    multiplier: float,
+    quantile: float,
     error: float,
     generator: torch.Generator,
     rng: np.random.Generator,
 ) -> Interval:
-    """Return the interval of λ_min(∇²J), the spread of the H_k taken ``inflation`` times."""
+    """Return the interval of λ_min(∇²J), ``inflation`` times the standard deviations of H_k."""
     estimate = float(spectrum.leftmost[0])
     upper = math.inf
-    for half, product in enumerate(sample.half_products):
+    for fold, product in enumerate(sample.fold_products):
         direction = lanczos_spectrum(
-            product, spectrum.vector, generator, n_steps=_HALF_STEPS
+            product, spectrum.vector, generator, n_steps=_FOLD_STEPS
         ).vector
-        held_out = (sample.products(direction) @ direction)[1 - half :: 2].cpu().numpy()
-        spread = inflation * float(held_out.std(ddof=1))
-        upper = min(upper, upper_limit(held_out, error / 2.0, rng, least_spread=spread))
+        held_out = (sample.products(direction) @ direction)[1 - fold :: 2].cpu().numpy()
+        std = inflation * float(held_out.std(ddof=1))
+        upper = min(upper, bootstrap_upper_limit(held_out, error / 2.0, rng, min_std=std))
     start = torch.randn(sample.size, generator=generator, dtype=torch.float64)
-    lower = worst_curvature(
-        sample, spectrum.vector, start.to(spectrum.vector), inflation * multiplier
+    lower = robust_lambda_min(
+        sample, spectrum.vector, start.to(spectrum.vector), inflation * quantile
     )
     return Interval(estimate, min(lower, estimate - spectrum.residual), max(upper, estimate))
 
 
-def upper_limit(
-    values: FloatArray, error: float, rng: np.random.Generator, *, least_spread: float = 0.0
+def bootstrap_upper_limit(
+    values: FloatArray, error: float, rng: np.random.Generator, *, min_std: float = 0.0
 ) -> float:
     """Return the studentised bootstrap's upper limit for the mean of ``values``, [n].
 
-    mean - q s/√n, with q the ``error``-quantile of (mean* - mean)/(s*/√n) over resamples, and s the
-    standard deviation or ``least_spread`` if larger. Infinite where too many resamples consist of
-    one value: there are too few values for a limit.
+    The limit is mean - q s/√n. s is the larger of the standard deviation and ``min_std``. q is the
+    ``error``-quantile of (mean* - mean)/(s*/√n) over resamples. The limit is infinite for small n,
+    where too many resamples consist of one value.
 
     References
     ----------
     Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section 12.5.
     """
     n = len(values)
-    mean, spread = float(values.mean()), float(values.std(ddof=1))
-    if spread == 0.0:
-        return mean + float(student.isf(error, n - 1)) * least_spread / math.sqrt(n)
+    mean, std = float(values.mean()), float(values.std(ddof=1))
+    if std == 0.0:
+        return mean + float(student.isf(error, n - 1)) * min_std / math.sqrt(n)
     resamples = values[rng.integers(n, size=(N_RESAMPLES, n))]
     with np.errstate(divide="ignore", invalid="ignore"):
         pivots = (resamples.mean(1) - mean) / (resamples.std(1, ddof=1) / math.sqrt(n))
     quantile = np.quantile(np.nan_to_num(pivots, nan=0.0), error, method="lower")
-    return mean - float(quantile) * max(spread, least_spread) / math.sqrt(n)
+    return mean - float(quantile) * max(std, min_std) / math.sqrt(n)

@@ -1,4 +1,4 @@
-"""What a certificate says, for people and for programs."""
+"""The report of a certificate: intervals, verdict, text and plot."""
 
 from __future__ import annotations
 
@@ -28,26 +28,25 @@ class SospReport:
     Attributes
     ----------
     gradient_norm, lambda_min
-        ‖∇J‖ and λ_min(∇²J) with their confidence intervals, which hold together with probability
-        ``confidence``. The estimates are those of the mean gradient and Hessian: noise makes the
-        first too large and the second too small, as the intervals allow for.
+        ‖∇J‖ and λ_min(∇²J) with their confidence intervals, which cover jointly with probability
+        ``confidence``. The estimates ‖ĝ‖ and λ_min(Ĥ) belong to the mean gradient and Hessian.
+        Noise makes the first too large and the second too small. The intervals account for that.
     epsilon, rho
         ε and ρ of ‖∇J‖ ≤ ε, λ_min(∇²J) ≥ -√(ρε).
     thresholds
-        Where ε and ρ come from, for people.
+        Origin of ε and ρ, as text.
     confidence, interval
-        1 - δ, and how the intervals were made.
+        1 - δ, and the method of the intervals.
     n_episodes, n_steps
-        What the estimates rest on.
-    likely_gradient_norm
-        ‖∇J‖ estimated without the bias of noise.
+        Numbers of episodes and of steps in the estimates.
+    debiased_gradient_norm
+        Estimate of ‖∇J‖ without the bias of noise.
     gradient
-        Estimate of ∇J, [d], in the order of ``policy.parameters()`` that log π depends on.
+        Estimate of ∇J, [d], in the order of those ``policy.parameters()`` that log π depends on.
     escape_direction
-        Unit leftmost eigenvector of the estimated Hessian, [d], its sign such that J does not
-        ascend along it to first order.
+        Unit leftmost eigenvector v of Ĥ, [d], with v·ĝ ≤ 0.
     spectrum
-        Leftmost eigenvalues and spectral density of the estimated Hessian.
+        Leftmost eigenvalues and spectral density of Ĥ.
     """
 
     gradient_norm: Interval
@@ -59,7 +58,7 @@ class SospReport:
     interval: IntervalMethod
     n_episodes: int
     n_steps: int
-    likely_gradient_norm: float
+    debiased_gradient_norm: float
     gradient: Tensor
     escape_direction: Tensor
     spectrum: Spectrum
@@ -71,12 +70,12 @@ class SospReport:
 
     @property
     def verdict(self) -> Verdict:
-        """What the intervals prove.
+        """The conclusion from both intervals.
 
-        "not stationary": ‖∇J‖ > ε. Else ‖∇J‖ ≤ ε, and "sosp": λ_min ≥ -√(ρε), or "saddle":
-        λ_min < -√(ρε), be it a saddle or a maximum of the cost. "undecided" where a threshold lies
-        inside its interval. A wrong verdict has probability 1 - ``confidence`` at most, whatever
-        chose ε and ρ: the intervals do not depend on them.
+        "not stationary": ‖∇J‖ > ε. "sosp": ‖∇J‖ ≤ ε and λ_min ≥ -√(ρε). "saddle": ‖∇J‖ ≤ ε and
+        λ_min < -√(ρε), which includes maxima of the cost. "undecided": a threshold lies inside its
+        interval. A verdict is wrong with probability 1 - ``confidence`` at most. That holds for
+        every choice of ε and ρ, since the intervals do not depend on them.
         """
         if self.gradient_norm.lower > self.epsilon:
             return "not stationary"
@@ -89,24 +88,24 @@ class SospReport:
 
     @property
     def episodes_to_decide(self) -> int | None:
-        """About how many episodes would decide, as intervals shrink with the root of their number.
+        """Approximate number of episodes that would decide; see :func:`episodes_to_decide`.
 
-        ``None`` where the verdict is not "undecided", or where the intervals tell no number: one is
-        unlimited, or what is likely lies on a threshold.
+        ``None`` if the verdict is not "undecided", or if the intervals determine no number: an
+        interval is unbounded, or an estimate lies on its threshold.
         """
         if self.verdict != "undecided":
             return None
         return episodes_to_decide(
             self.gradient_norm,
             self.lambda_min,
-            self.likely_gradient_norm,
+            self.debiased_gradient_norm,
             self.epsilon,
             self.curvature_threshold,
             self.n_episodes,
         )
 
     def __str__(self) -> str:
-        """Return a few lines for people."""
+        """Return a summary of several lines."""
         leftmost = ", ".join(f"{value:.3g}" for value in self.spectrum.leftmost)
         lines = [
             f"{self.verdict}: ε = {self.epsilon:.3g}, ρ = {self.rho:.3g}, "
@@ -164,9 +163,9 @@ def _draw_interval(
 
 
 def _draw_density(axes: Axes, spectrum: Spectrum, threshold: float) -> None:
-    """Draw the density, and the Ritz values as stems, each as high as its own part of it."""
+    """Draw the density and the Ritz values. A stem's height is the Ritz value's peak density."""
     low, high = spectrum.values[0], spectrum.values[-1]
-    if low - threshold <= max(high - low, 1e-12):  # one farther off would hide the spectrum
+    if low - threshold <= max(high - low, 1e-12):  # a distant threshold would hide the spectrum
         low, high = min(low, threshold), max(high, threshold)
     else:
         axes.text(0.02, 0.9, "← -√(ρε)", color="C3", fontsize=8, transform=axes.transAxes)
@@ -176,7 +175,7 @@ def _draw_density(axes: Axes, spectrum: Spectrum, threshold: float) -> None:
     density = spectrum.density(points, width=width)
     heights = spectrum.weights / (width * math.sqrt(2.0 * math.pi))
     top = max(density.max(), heights.max())
-    # far below 1/d of a network's eigenvalues; no stem ends below
+    # far below the share 1/d of one of a network's eigenvalues. Every stem is drawn above it
     bottom = 1e-7 * top
     leftmost = np.isin(spectrum.values, spectrum.leftmost)
     axes.semilogy(points, np.maximum(density, bottom), color="C0", lw=1)

@@ -1,4 +1,4 @@
-"""The policy and the environment that a certificate is asked of."""
+"""The policy, the environment and the α of the model that a certificate is for."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ENVIRONMENT = requires(
 
 
 def policy_of(model: OnPolicyAlgorithm) -> ActorCriticPolicy:
-    """Return the model's policy, or raise ValueError where it has none that can be judged."""
+    """Return the model's policy, or raise ValueError if it is no feed-forward ActorCriticPolicy."""
     policy = getattr(model, "policy", None)
     if not isinstance(policy, ActorCriticPolicy) or hasattr(policy, "lstm_actor"):
         raise ValueError(
@@ -29,7 +29,7 @@ def policy_of(model: OnPolicyAlgorithm) -> ActorCriticPolicy:
 
 
 def environment_of(model: OnPolicyAlgorithm, env: GymEnv | None) -> VecEnv:
-    """Return the environment to simulate in, wrapped as SB3 does."""
+    """Return ``env`` wrapped by SB3, or the model's own environment if ``env`` is ``None``."""
     if env is not None:
         ENVIRONMENT("certify_sosp: env", env)
         env = model._wrap_env(env, monitor_wrapper=False)
@@ -48,9 +48,9 @@ def environment_of(model: OnPolicyAlgorithm, env: GymEnv | None) -> VecEnv:
 
 
 def _in_rollout(model: OnPolicyAlgorithm) -> bool:
-    """Whether resetting the model's environment would break a rollout.
+    """Return whether the model is in mid-rollout, where a reset would corrupt the rollout.
 
-    SB3 keeps no flag, but a rollout that has begun leaves its buffer partly filled.
+    SB3 has no flag for it. In mid-rollout its buffer is partly filled.
     """
     if isinstance(model, PolicyNewtonAlgorithm):
         return model._collecting
@@ -59,7 +59,7 @@ def _in_rollout(model: OnPolicyAlgorithm) -> bool:
 
 
 def paper_alpha(model: OnPolicyAlgorithm) -> float | None:
-    """Return the current α of a model whose cubic term is the paper's; ``None`` for others."""
+    """Return the current α of a model with the paper's cubic term; ``None`` for other models."""
     if not isinstance(model, PolicyNewtonAlgorithm):
         return None
     if model.target_kl is not None or model.metric != "euclidean":

@@ -1,4 +1,4 @@
-"""The constants of the convergence theory and the parameters that it asks for.
+"""The constants of the convergence theory and the parameters of its theorems.
 
 >>> from sb3_crpn.theory import Constants, expectation_recipe, softmax_linear
 >>> constants = Constants(K=1.0, scores=softmax_linear(feature_norm=1.0), H=1, d=4)
@@ -6,9 +6,9 @@
 >>> sorted(recipe.kwargs)
 ['alpha', 'gamma', 'horizon', 'n_episodes', 'n_hessian_episodes']
 
-Symbols are those of Maniyar et al., AISTATS 2024. Their values are derived here, in the docstrings,
-and tested against enumerated decision processes. The paper's own are in `printed`, under names that
-begin with "printed"; ``python -m sb3_crpn.theory`` compares the two.
+Symbols are those of Maniyar et al., AISTATS 2024. The docstrings derive their values, and tests
+compare them with enumerated decision processes. The module `printed` has the values of the paper,
+under names that begin with "printed". ``python -m sb3_crpn.theory`` compares both.
 """
 
 from sb3_crpn.theory.constants import Constants

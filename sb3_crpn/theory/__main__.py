@@ -24,7 +24,7 @@ from sb3_crpn.theory.recipes import Recipe
 FAILURE_PROBABILITY = 0.05
 _SOFTMAX = softmax_linear(1.0)
 _GAUSSIAN = gaussian_linear(1.0, 0.5, 2, n_actions=10**7, failure_probability=FAILURE_PROBABILITY)
-# Two-armed bandit, the coordination MDP, and policies of two and more actions on longer episodes
+# A two-armed bandit, the coordination MDP, and longer episodes
 PROBLEMS = {
     "softmax, H = 1, d = 4, gamma = 1": Constants(1.0, _SOFTMAX, 1, 4),
     "softmax, H = 2, d = 6, gamma = 1": Constants(1.0, _SOFTMAX, 2, 6),
@@ -33,12 +33,13 @@ PROBLEMS = {
     "softmax, H = 500, d = 10, gamma = 0.99": Constants(1.0, _SOFTMAX, 500, 10, 0.99),
     "Gaussian, H = 50, d = 22, gamma = 0.99": Constants(1.0, _GAUSSIAN, 50, 22, 0.99),
 }
-# Recipes are compared at the same bound on ‖∇J‖, this part of the largest ε that says anything
-EPSILON_PART = 0.1
+# Recipes are compared at the same bound on ‖∇J‖. It is this fraction of M_H²/L_H, beyond which the
+# second-order condition is void
+EPSILON_FRACTION = 0.1
 
 
 def table() -> str:
-    """Return the Markdown table: a row per number, "printed / ours = ratio" per problem."""
+    """Return the Markdown table: a row per number, "printed / derived = ratio" per problem."""
     columns = [dict(numbers(problem)) for problem in PROBLEMS.values()]
     lines = [f"| | {' | '.join(PROBLEMS)} |", "|---" * (len(PROBLEMS) + 1) + "|"]
     for name in columns[0]:
@@ -48,7 +49,7 @@ def table() -> str:
 
 
 def numbers(problem: Constants) -> Iterator[tuple[str, tuple[float, float]]]:
-    """Yield the name of each number, and the number as printed and as derived."""
+    """Yield the name, the printed value and the derived value of each number."""
     printed = PrintedConstants(problem)
     yield "‖∇J‖ ≤", (printed.M_H, problem.M_g)
     yield "‖∇²J‖ ≤", (printed.G_H, problem.M_H)
@@ -67,8 +68,8 @@ def numbers(problem: Constants) -> Iterator[tuple[str, tuple[float, float]]]:
 
 
 def recipe_pairs(problem: Constants) -> dict[str, tuple[Recipe, Recipe]]:
-    """Return each theorem's recipe as printed and as derived, of one bound on ‖∇J‖."""
-    epsilon, delta = EPSILON_PART * problem.M_H**2 / problem.L_H, FAILURE_PROBABILITY
+    """Return the printed and the derived recipe of each theorem, with equal bounds on ‖∇J‖."""
+    epsilon, delta = EPSILON_FRACTION * problem.M_H**2 / problem.L_H, FAILURE_PROBABILITY
     finer = epsilon / 25.0
     return {
         "expectation": (
@@ -86,8 +87,8 @@ def recipe_pairs(problem: Constants) -> dict[str, tuple[Recipe, Recipe]]:
     }
 
 
-def _cell(printed: float, ours: float) -> str:
-    return f"{printed:.3g} / {ours:.3g} = {printed / ours:.3g}"
+def _cell(printed: float, derived: float) -> str:
+    return f"{printed:.3g} / {derived:.3g} = {printed / derived:.3g}"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""G, L_1 and L_2: bounds on log π for policies that are linear in bounded features."""
+"""Bounds G, L_1 and L_2 on the derivatives of log π, for policies linear in bounded features."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from sb3_crpn.checks import COUNT, FLAG, POSITIVE, real
 
 @dataclass(frozen=True)
 class ScoreBounds:
-    """How fast log π(a|s;θ) and its derivatives can change with θ, for all s, a and θ.
+    """Bounds on the derivatives of log π(a|s;θ) with respect to θ, for all s, a and θ.
 
-    Norms are Euclidean and spectral. Units: reciprocals of θ's, squared for L_1, cubed for L_2.
+    Norms are Euclidean and spectral. With the unit u of θ, the units are 1/u, 1/u² and 1/u³.
 
     Attributes
     ----------
@@ -37,16 +37,16 @@ class ScoreBounds:
 def softmax_linear(feature_norm: float, *, bias: bool = True) -> ScoreBounds:
     """Return the bounds of π(·|s) = softmax(Wφ(s) + b), ‖φ(s)‖ ≤ ``feature_norm``.
 
-    SB3's policy on a Discrete action space with ``net_arch=[]``; φ is the observation, of norm 1
-    for a Discrete one.
+    This is SB3's policy on a Discrete action space with ``net_arch=[]``. φ is the observation. The
+    one-hot vector of a Discrete observation has norm 1.
 
-    With B² = ‖φ‖² (+ 1 for b), the derivatives of log π are those of log-sum-exp, the cumulants of
-    the one-hot action e_a under π, times powers of φ:
+    Let B² = ‖φ‖² (+ 1 for b). The derivatives of log π are those of log-sum-exp: the cumulants of
+    the one-hot action e_a under π times powers of φ.
 
-    - ∇log π = (e_a - π) ⊗ φ, and ‖e_a - π‖ < √2: G = √2·B, approached where a is improbable;
-    - -∇²log π = Cov(e_a) ⊗ φφᵀ. For a unit vector u, u_a has range ≤ √2, its variance is at most
-      √2²/4: L_1 = B²/2, attained by two equally probable actions;
-    - -∇³log π [v, v, v] is the third central moment of (Vφ)_a, at most range³/(6√3):
+    - ∇log π = (e_a - π) ⊗ φ, and ‖e_a - π‖ < √2. Hence G = √2·B, the supremum as π_a → 0.
+    - -∇²log π = Cov(e_a) ⊗ φφᵀ. For a unit vector u, u_a has range ≤ √2, and its variance is at
+      most √2²/4. Hence L_1 = B²/2, attained by two equally probable actions.
+    - -∇³log π [v, v, v] is the third central moment of (Vφ)_a, at most range³/(6√3). Hence
       L_2 = (√6/9)·B³, attained by two actions of probabilities (1 ± 1/√3)/2.
 
     Parameters
@@ -54,7 +54,7 @@ def softmax_linear(feature_norm: float, *, bias: bool = True) -> ScoreBounds:
     feature_norm
         Bound on ‖φ(s)‖, > 0.
     bias
-        Whether b is a parameter too, as in SB3.
+        Whether b is a parameter, as in SB3.
     """
     norm = _norm("softmax_linear", feature_norm, bias)
     return ScoreBounds(
@@ -73,19 +73,19 @@ def gaussian_linear(
 ) -> ScoreBounds:
     """Return the bounds of π(·|s) = N(Wφ(s) + b, Σ) with fixed, diagonal Σ.
 
-    **G is not a bound for every action**: the score Σ⁻¹(a - μ) ⊗ φ of a Gaussian policy is
-    unbounded. It holds for all of the first ``n_actions`` actions with probability at least
-    1 - ``failure_probability``. Clipping actions on their way to the environment, as SB3 does,
-    changes nothing: log π is that of the unclipped action.
+    **G does not bound every score.** The score Σ⁻¹(a - μ) ⊗ φ of a Gaussian policy is unbounded. G
+    bounds the scores of the first ``n_actions`` actions with probability at least
+    1 - ``failure_probability``. SB3 clips actions for the environment only. log π is that of the
+    unclipped action, so that the bounds hold with clipping.
 
-    With B² = ‖φ‖² (+ 1 for b) and ξ = Σ^(-½)(a - μ) standard normal of dimension k:
+    Let B² = ‖φ‖² (+ 1 for b), and let ξ = Σ^(-½)(a - μ), standard normal of dimension k.
 
-    - ‖∇log π‖ ≤ (B/std)‖ξ‖, and ‖ξ‖² ≤ k + 2√(kx) + 2x but for probability e^(-x) (Laurent and
-      Massart, Ann. Statist. 28, 2000, Lemma 1); x = log(n_actions/failure_probability);
-    - ∇²log π = -Σ⁻¹ ⊗ φφᵀ: L_1 = B²/std², whatever the action;
-    - ∇²log π does not depend on θ: L_2 = 0.
+    - ‖∇log π‖ ≤ (B/std)‖ξ‖. ‖ξ‖² > k + 2√(kx) + 2x has a probability of at most e^(-x) (Laurent and
+      Massart, Ann. Statist. 28, 2000, Lemma 1). x = log(n_actions/failure_probability).
+    - ∇²log π = -Σ⁻¹ ⊗ φφᵀ. Hence L_1 = B²/std² for every action.
+    - ∇²log π does not depend on θ. Hence L_2 = 0.
 
-    SB3's log_std is a parameter by default; these bounds are those of a policy in which it is not
+    In SB3 log_std is a parameter by default. The bounds require a fixed log_std
     (``policy.log_std.requires_grad_(False)`` before the algorithm selects the actor).
 
     Parameters
@@ -97,11 +97,11 @@ def gaussian_linear(
     action_dim
         k, the dimension of the action.
     n_actions
-        The number of actions drawn, of all updates and environments together.
+        Number of actions of all updates and environments together.
     failure_probability
         In (0, 1].
     bias
-        Whether b is a parameter too, as in SB3.
+        Whether b is a parameter, as in SB3.
     """
     norm = _norm("gaussian_linear", feature_norm, bias)
     std = POSITIVE("gaussian_linear: std", std)
@@ -116,6 +116,6 @@ def gaussian_linear(
 
 
 def _norm(function: str, feature_norm: float, bias: bool) -> float:
-    """Return the norm of the features, with the constant feature of a bias."""
+    """Return the bound on the norm of the features, including the constant feature of a bias."""
     norm: float = POSITIVE(f"{function}: feature_norm", feature_norm)
     return math.hypot(norm, 1.0) if FLAG(f"{function}: bias", bias) else norm

@@ -1,16 +1,18 @@
-r"""The constants and parameters that the paper prints, beside those derived in this package.
+r"""The constants and parameters as printed in the paper.
 
-Maniyar, Prashanth L.A., Mondal and Bhatnagar, AISTATS 2024. Everything here is the text's own
-formula, its slips included; `Constants` and the recipes without "printed" are derived anew, and
-smaller but for two numbers (docs/THEORY.md, "Printed and derived"). What the formulas lack:
+Maniyar, Prashanth L.A., Mondal and Bhatnagar, AISTATS 2024. This module implements the formulas of
+the text, including its errata. `Constants` and the recipes without "printed" in their names are
+derived in this package. All derived values but two are smaller (docs/THEORY.md, "Printed and
+derived"). Errata of the formulas:
 
-- b_k of the theorem in expectation lacks 1/L_H, and so does t_1 = ε/144, for which the proof needs
-  L_H ε/18. The episodes are too few where L_H < 1 and L_H < 1/8.
-- b_k ≥ 4(1 + 2 log 2d) is needed by the lemma on the errors and not asked for by the theorem.
-- K H bounds Σ_{h<H} γ^h c_h. It does not bound the text's Σ_{h=0}^{H-1} γ^{h-1} c_h for γ < 1,
-  which is 1/γ times as large: the constants are those of this package's J, not of the text's.
-- With high probability the *mean* of ‖θ_k - θ_{k-1}‖³ over k is small. For one R drawn at random
-  the proof has it in expectation over R only.
+- Theorem 2: b_k lacks the factor 1/L_H. It is too small where L_H < 1.
+- Theorem 3: t_1 = ε/144 lacks the factor L_H. The proof needs L_H ε/18. b_k is too small where
+  L_H < 1/8.
+- Theorem 2 omits the condition b_k ≥ 4(1 + 2 log 2d) of its Lemma 5.
+- K H bounds Σ_{h<H} γ^h c_h. For γ < 1 it does not bound the text's Σ_{h=0}^{H-1} γ^{h-1} c_h,
+  which is 1/γ times as large. The constants therefore belong to this package's J.
+- Theorem 3: the proof bounds the *mean* of ‖θ_k - θ_{k-1}‖³ over k with high probability. For a
+  random R it bounds the expectation over R only.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from sb3_crpn.checks import COUNT, POSITIVE, integer
 from sb3_crpn.theory.constants import Constants
 from sb3_crpn.theory.recipes import CONSTANTS, PROBABILITY, Recipe, batches
 
-# Theorem on the approximate solution: "c_1, c_2 = 1/300 and c_3, c_4 = 1/200"; c_2 is not used
+# Theorem 4: "c_1, c_2 = 1/300 and c_3, c_4 = 1/200". The formulas do not contain c_2
 C_1 = 1 / 300
 C_3 = C_4 = 1 / 200
 
@@ -32,10 +34,11 @@ _GUARANTEE = {"gradient_factor": 25.0, "curvature_factor": 7.0}
 
 @dataclass(frozen=True)
 class PrintedConstants:
-    """What the paper prints for the K, G, L_1, L_2 (Assumptions 1-3), H and d of ``problem``.
+    """The paper's constants for the K, G, L_1, L_2 (Assumptions 1-3), H and d of ``problem``.
 
-    Beware of M_H: the text's bounds ‖∇J‖ and corresponds to :attr:`Constants.M_g`. The text's G_H
-    bounds ‖∇²J‖, :attr:`Constants.M_H`, and one episode's estimate of it, :attr:`Constants.G_H`.
+    Two symbols differ from :class:`Constants`. The text's M_H bounds ‖∇J‖ and corresponds to
+    :attr:`Constants.M_g`. The text's G_H bounds both ‖∇²J‖ (:attr:`Constants.M_H`) and one
+    episode's estimate of ∇²J (:attr:`Constants.G_H`).
     """
 
     problem: Constants
@@ -50,7 +53,7 @@ class PrintedConstants:
 
     @property
     def M_H(self) -> float:  # noqa: N802
-        """‖∇J‖ ≤ K G H³ (Proposition 1). The proof of Lemma 2 has it with H²."""
+        """‖∇J‖ ≤ K G H³ (Proposition 1). The proof of Lemma 2 shows the bound with H²."""
         return self._KH(3) * self.problem.scores.G
 
     @property
@@ -82,7 +85,7 @@ class PrintedConstants:
 
     @property
     def least_hessian_episodes(self) -> int:
-        """The least b_k for which the bound on H's error is stated: 4 (1 + 2 log 2d) (Lemma 5)."""
+        """The minimum b_k of the bound on H's error, 4 (1 + 2 log 2d) (Lemma 5)."""
         return math.ceil(4.0 * self._logarithm)
 
     def gradient_error(self, n_episodes: int) -> float:
@@ -93,12 +96,12 @@ class PrintedConstants:
     def hessian_error(self, n_episodes: int) -> float:
         """Bound (E‖H - ∇²J‖³)^⅓ of b episodes: (4 √(15 (1 + 2 log 2d)) d G_H³)^⅓/√b (Lemma 5).
 
-        The proof takes E max_τ‖Δ_τ‖² ≤ G_H² from E‖Δ_τ‖² ≤ G_H², which does not give it.
+        The proof uses E max_τ‖Δ_τ‖² ≤ G_H², which does not follow from E‖Δ_τ‖² ≤ G_H².
 
         Raises
         ------
         ValueError
-            For fewer episodes than the lemma supposes.
+            ``n_episodes`` is below :attr:`least_hessian_episodes`.
         """
         allowed = integer(self.least_hessian_episodes)
         n_episodes = allowed("hessian_error: n_episodes", n_episodes)
@@ -120,18 +123,18 @@ def printed_expectation_recipe(
     """Return CRPN's parameters as printed in Theorem 2: E‖∇J(θ_R)‖ ≤ 25ε, E λ_min ≥ -7√(L_H ε).
 
     α = 3 L_H, N = 12 (J(θ_0) - J*) √L_H / ε^{3/2}, m = 25 G_g²/(4ε²),
-    b = 36 (30 (1 + 2 log 2d))^⅓ d^⅔ G_H²/ε, each rounded up; R is uniform on 1, …, N. What the
-    formulas lack is in this module's docstring.
+    b = 36 (30 (1 + 2 log 2d))^⅓ d^⅔ G_H²/ε, each rounded up. R is uniform on 1, …, N. The module's
+    docstring lists the errata.
 
     Parameters
     ----------
     constants
-        Of the policy and the environment; K, G, L_1, L_2, H and d are read.
+        Constants of the policy and the environment. K, G, L_1, L_2, H and d are read.
     epsilon
-        ε > 0, of which the guarantee is a multiple: :attr:`Recipe.gradient_bound`.
+        ε > 0. The guarantee is a multiple of it: :attr:`Recipe.gradient_bound`.
     initial_gap
-        J(θ_0) - J* or a bound on it; ``None``: 2 K H, with which N is Remark 1's
-        24 K H √L_H / ε^{3/2}.
+        J(θ_0) - J* or an upper bound. ``None``: 2 K H, which gives Remark 1's
+        N = 24 K H √L_H / ε^{3/2}.
 
     Raises
     ------
@@ -153,14 +156,14 @@ def printed_high_probability_recipe(
     failure_probability: float,
     initial_gap: float | None = None,
 ) -> Recipe:
-    """Return CRPN's parameters as printed in Theorem 3, of the same bounds with high probability.
+    """Return CRPN's parameters as printed in Theorem 3: the same bounds with high probability.
 
-    α and N are those of :func:`printed_expectation_recipe`, and with δ' = δ/(2N), of which the
-    theorem makes the probability 1 - 2Nδ',
+    α and N are those of :func:`printed_expectation_recipe`. With δ' = δ/(2N), hence the theorem's
+    probability 1 - 2Nδ' = 1 - δ,
 
     m = max(M_1/t, M_1²/t²) (8/3) log(2d/δ'), b = max(M_2/√t_1, M_2²/t_1) (8/3) log(2d/δ').
 
-    The theorem leaves t and t_1 free; its proof takes t = 2ε/5 and t_1 = ε/144, as done here.
+    The theorem does not fix t and t_1. t = 2ε/5 and t_1 = ε/144 are those of its proof.
 
     Parameters
     ----------
@@ -199,10 +202,10 @@ def printed_approximate_recipe(
     m = max(M_1/(c_1 ε), M_1²/(c_3² ε²)) log(d √ρ/(ε^{3/2} δ' c_3)),
     b = max(M_2/(c_4 √(ρε)), M_2²/(c_4² ρε)) log(d √ρ/(ε^{3/2} δ' c_4)).
 
-    N̂ lacks ℓ/√ρ and a logarithm, so that it has the units of ε^{-½}; the logarithms of m and b lack
-    J(θ_0) - J*. The text has no c', for which ACRPN has σ = ε√(ρε)/ℓ, and no number of updates
-    but its order. Here N̄ = 100 (J(θ_0) - J*) √ρ/ε^{3/2}: until it ends, every update predicts a
-    decrease of more than (1/100) √(ε³/ρ).
+    N̂ lacks ℓ/√ρ and a logarithm, and therefore has the units of ε^{-½}. The logarithms of m and b
+    lack J(θ_0) - J*. The text does not define c'; ACRPN uses σ = ε√(ρε)/ℓ. The text gives the order
+    of the number of updates only. N = 100 (J(θ_0) - J*) √ρ/ε^{3/2} is used here, since before its
+    end every update predicts a decrease of more than (1/100) √(ε³/ρ).
 
     Parameters
     ----------
@@ -238,12 +241,13 @@ def printed_approximate_recipe(
 def printed_approximate_complexity(
     constants: Constants, epsilon: float, initial_gap: float | None = None
 ) -> tuple[float, float]:
-    """Return what Theorem 4's O(·) holds: gradients of episodes and Hessian-vector products.
+    """Return the arguments of Theorem 4's O(·): episode gradients and Hessian-vector products.
 
-    χ√ρ/ε^{3/2} max(M_1/ε, M_1²/ε²) and χ√ρ/ε^{3/2} max(M_2/√(ρε), M_2²/(ρε))/√ε, χ ≥ J(θ_0) - J*:
-    ε^{-7/2} and ε^{-3} as ε → 0 (Remark 3). Without 1/√ε = N̂ the latter is the number of episodes.
+    χ√ρ/ε^{3/2} max(M_1/ε, M_1²/ε²) and χ√ρ/ε^{3/2} max(M_2/√(ρε), M_2²/(ρε))/√ε, χ ≥ J(θ_0) - J*.
+    Their orders are ε^{-7/2} and ε^{-3} as ε → 0 (Remark 3). The factor 1/√ε is N̂. Without it the
+    second number is that of the episodes.
 
-    Those of Theorems 2 and 3 are :attr:`Recipe.gradient_episodes` and
+    The numbers of Theorems 2 and 3 are :attr:`Recipe.gradient_episodes` and
     :attr:`Recipe.hessian_episodes` (Remark 2).
     """
     name = "printed_approximate_complexity"
@@ -259,7 +263,7 @@ def printed_approximate_complexity(
 def _checked(
     function: str, constants: Constants, epsilon: float, initial_gap: float | None
 ) -> tuple[PrintedConstants, float, float]:
-    """Return the printed constants, ε and J(θ_0) - J* or its bound, for good arguments."""
+    """Check the arguments. Return the printed constants, ε and J(θ_0) - J* or its bound."""
     printed = PrintedConstants(CONSTANTS(f"{function}: constants", constants))
     gap = printed.initial_gap if initial_gap is None else initial_gap
     epsilon = POSITIVE(f"{function}: epsilon", epsilon)

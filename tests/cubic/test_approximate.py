@@ -263,14 +263,14 @@ def test_a_recursion_as_printed_is_rejected(monkeypatch):
     """The paper's Finalsolver adds ∇m to its predecessor; it does not meet its tolerance."""
     problem = spectral("", np.linspace(0.1, 1, 8), np.ones(8) / 8, seed=1)
 
-    def as_printed(g, operator, rho, lipschitz, target, steps):
-        step, slope = torch.zeros_like(g), g
-        for _ in range(steps):
-            step = step - slope / (20 * lipschitz)
-            slope = slope + operator(step) + rho / 2 * step.norm() * step
-        return approximate._Descent(step, operator(step), "as printed")
+    def as_printed(problem, tolerance):
+        step, slope = torch.zeros_like(problem.g), problem.g
+        for _ in range(approximate._max_steps(problem)):
+            step = step - slope / (20 * problem.lipschitz)
+            slope = slope + problem.operator(step) + problem.rho / 2 * step.norm() * step
+        return approximate._Candidate(step, problem.operator(step), "as printed")
 
-    monkeypatch.setattr(approximate, "_descend", as_printed)
+    monkeypatch.setattr(approximate, "_gradient_descent", as_printed)
     result = cubic_finalsolver(problem.gradient, problem.hvp(), 1.0, epsilon=1e-3, max_steps=2000)
     assert not result.residual <= 1e-3 / 2
 

@@ -210,7 +210,7 @@ def test_another_alpha_costs_no_product():
     hvp = problem.hvp()
     g = torch.from_numpy(problem.gradient)
     space = KrylovSpace(CountedOperator("hvp", hvp), g)
-    chain = space.open(g)
+    chain = space.start_chain(g)
     for _ in range(problem.dim):
         space.extend(chain)
     assert len(hvp.calls) == problem.dim
@@ -226,10 +226,10 @@ def test_residual_is_known_without_a_product():
     problem = large(hide=1)
     H, g = torch.from_numpy(problem.hessian), torch.from_numpy(problem.gradient)
     space = KrylovSpace(CountedOperator("hvp", Counter(H)), g)
-    chains = [space.open(g)]
+    chains = [space.start_chain(g)]
     for turn in range(20):
         if turn == 8:
-            chains.append(space.open(torch.ones_like(g)))
+            chains.append(space.start_chain(torch.ones_like(g)))
         space.extend(chains[turn % len(chains)])
     point = krylov._minimise(space, float(g.norm()), 1.0, 1e-8)
     s = space.basis.T @ torch.from_numpy(point.coordinates)
@@ -240,7 +240,7 @@ def test_residual_is_known_without_a_product():
 
 
 def break_random_start(monkeypatch):
-    monkeypatch.setattr(krylov, "_curvature_is_known", lambda *_: True)
+    monkeypatch.setattr(krylov, "_leftmost_is_resolved", lambda *_: True)
 
 
 def break_hard_case(monkeypatch):
@@ -248,11 +248,11 @@ def break_hard_case(monkeypatch):
 
 
 def break_stopping_rule(monkeypatch):
-    monkeypatch.setattr(krylov, "residual_limit", lambda *_: 0.1)
+    monkeypatch.setattr(krylov, "residual_tolerance", lambda *_: 0.1)
 
 
 def break_orthogonality(monkeypatch):
-    monkeypatch.setattr(lanczos.KrylovSpace, "_outside", lambda self, v: 1.0 * v)
+    monkeypatch.setattr(lanczos.KrylovSpace, "_orthogonalise", lambda self, v: 1.0 * v)
 
 
 def break_multiplier(monkeypatch):

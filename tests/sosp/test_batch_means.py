@@ -43,7 +43,7 @@ def test_halves_and_moments_are_those_of_the_blocks():
     identity = torch.eye(sample.size, dtype=torch.float64)
     hessians = torch.stack([sample.products(column) for column in identity], dim=2)
     mean = hessians.mean(0)
-    for half, product in enumerate(sample.half_products):
+    for half, product in enumerate(sample.fold_products):
         torch.testing.assert_close(product(v), hessians[half::2].mean(0) @ v)
     torch.testing.assert_close(sample.mean_product(v), mean @ v)
     variance = ((hessians - mean) @ (hessians - mean)).sum(0) / 3

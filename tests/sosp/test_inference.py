@@ -10,9 +10,9 @@ from sb3_crpn.sosp.inference import (
     bernstein_intervals,
     bernstein_radius,
     bootstrap_intervals,
-    upper_limit,
+    bootstrap_upper_limit,
 )
-from sb3_crpn.sosp.robust import worst_curvature
+from sb3_crpn.sosp.robust import robust_lambda_min
 from sb3_crpn.sosp.spectrum import lanczos_spectrum
 
 
@@ -109,7 +109,7 @@ def test_what_the_probabilities_imply_widens_the_intervals():
 
 @pytest.mark.parametrize("d", [3, 6])
 @pytest.mark.parametrize("noise", [0.1, 1.0])
-def test_the_worst_curvature_is_a_tight_bound(d, noise):
+def test_the_robust_lambda_min_is_a_tight_bound(d, noise):
     generator = torch.Generator().manual_seed(d)
     H = torch.diag(torch.linspace(-1.0, 2.0, d, dtype=torch.float64))
     sample = noisy_sample(torch.zeros(d, dtype=torch.float64), H, noise, 10, d)
@@ -120,7 +120,7 @@ def test_the_worst_curvature_is_a_tight_bound(d, noise):
         torch.linalg.eigh(mean).eigenvectors[:, 0],
         torch.randn(d, generator=generator),
     )
-    bound = worst_curvature(sample, leftmost, start.double(), 0.7)
+    bound = robust_lambda_min(sample, leftmost, start.double(), 0.7)
 
     v = torch.randn(200_000, d, generator=generator, dtype=torch.float64)
     v /= v.norm(dim=1, keepdim=True)
@@ -134,7 +134,7 @@ def test_the_worst_curvature_is_a_tight_bound(d, noise):
 @pytest.mark.parametrize("n", [10, 40])
 def test_the_studentised_limit_covers_the_mean_of_skewed_values(n):
     rng = np.random.default_rng(0)
-    misses = [upper_limit(rng.exponential(size=n), 0.1, rng) < 1.0 for _ in range(200)]
+    misses = [bootstrap_upper_limit(rng.exponential(size=n), 0.1, rng) < 1.0 for _ in range(200)]
     assert np.mean(misses) < 0.18
 
 

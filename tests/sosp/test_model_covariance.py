@@ -57,7 +57,7 @@ def nodes(kind, distribution, log_prob_gradient):
 
 @pytest.mark.parametrize("kind", ["gaussian", *ACTIONS])
 def test_it_averages_the_actions_at_their_probabilities(kind, monkeypatch):
-    monkeypatch.setattr(module, "RARE", 0.0)
+    monkeypatch.setattr(module, "MAX_RARE_COUNT", 0.0)
     policy, actor, batch = setting(kind)
     total = 0.0
     for i, weight in enumerate(batch.cost_advantages):
@@ -75,9 +75,9 @@ def test_the_rarest_actions_count_with_the_cost_to_go(monkeypatch):
     ).detach()
     ascending = probabilities.flatten().sort().values
     least = ascending[:4]
-    monkeypatch.setattr(module, "RARE", 0.0)
+    monkeypatch.setattr(module, "MAX_RARE_COUNT", 0.0)
     common = dense(policy, actor, batch)
-    monkeypatch.setattr(module, "RARE", float(least.sum()) + 1e-6)
+    monkeypatch.setattr(module, "MAX_RARE_COUNT", float(least.sum()) + 1e-6)
     costs = GAMMA ** episode_time(batch.lengths) * batch.returns
     total = 0.0
     for i, a in (probabilities <= least[-1]).nonzero():

@@ -5,10 +5,15 @@ import torch
 
 from sb3_crpn.sosp import Interval
 from sb3_crpn.sosp.model_covariance import episode_fisher
-from sb3_crpn.sosp.thresholds import TaskScales, choose_thresholds, episodes_to_decide, likely_norm
+from sb3_crpn.sosp.thresholds import (
+    TaskScales,
+    choose_thresholds,
+    debiased_norm,
+    episodes_to_decide,
+)
 from tests.policies import frozen_episodes, small_policy
 
-SCALES = TaskScales(returns=20.0, fisher=4.0)  # s = ½
+SCALES = TaskScales(rms_return=20.0, fisher_norm=4.0)  # s = ½
 
 
 def test_the_fisher_matrix_of_episodes_is_the_curvature_of_their_divergence():
@@ -31,7 +36,9 @@ def test_the_fisher_matrix_of_episodes_is_the_curvature_of_their_divergence():
     dense = torch.stack([product(column) for column in identity], dim=1)
     torch.testing.assert_close(dense, expected, rtol=1e-6, atol=1e-9)
     largest = torch.linalg.eigvalsh(expected)[-1].item()
-    assert TaskScales.from_episodes(policy, actor, batch).fisher == pytest.approx(largest, rel=1e-3)
+    assert TaskScales.from_episodes(policy, actor, batch).fisher_norm == pytest.approx(
+        largest, rel=1e-3
+    )
 
 
 @pytest.mark.parametrize(
@@ -93,7 +100,7 @@ def test_the_number_of_episodes_goes_with_the_square_of_the_width(
     assert needed == (None if expected is None else pytest.approx(expected, rel=0.06))
 
 
-def test_the_likely_norm_is_free_of_the_bias_of_noise():
+def test_the_debiased_norm_is_free_of_the_bias_of_noise():
     generator = torch.Generator().manual_seed(0)
     truth = torch.full((100,), 0.1, dtype=torch.float64)  # of norm 1
     squares, naive = [], []
@@ -101,8 +108,8 @@ def test_the_likely_norm_is_free_of_the_bias_of_noise():
         noise = 3.0 * torch.randn(20, 100, dtype=torch.float64, generator=generator)
         sample = truth + noise
         naive.append(float(sample.mean(0).norm()))
-        squares.append(likely_norm(sample) ** 2)
+        squares.append(debiased_norm(sample) ** 2)
     assert sum(naive) / 400 > 5.0
-    assert likely_norm(truth.expand(4, -1)) == pytest.approx(1.0)
+    assert debiased_norm(truth.expand(4, -1)) == pytest.approx(1.0)
     # negative squares are cut at 0, so that some bias is left
     assert 0.5 < sum(squares) / 400 < 5.0

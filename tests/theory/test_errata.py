@@ -1,4 +1,4 @@
-"""What the paper prints and cannot mean, each shown by a number (docs/THEORY.md, "Slips")."""
+"""Errata of the paper, each shown by a number (docs/THEORY.md, "Errata")."""
 
 import math
 from dataclasses import replace
