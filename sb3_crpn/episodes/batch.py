@@ -151,6 +151,8 @@ class EpisodeBatch:
         r_i, [T].
     log_probs
         log π(a_i|s_i) of the policy that acted, [T].
+    ratios
+        min(ρ̄, ρ_i), the importance ratio that A_i holds already, [T]; 1 in a fresh rollout.
     terminal_values
         V of the state after each segment's last step, [E]: 0 where it is not bootstrapped.
     times
@@ -169,6 +171,7 @@ class EpisodeBatch:
     returns: FloatArray
     rewards: FloatArray
     log_probs: FloatArray
+    ratios: FloatArray
     terminal_values: FloatArray
     times: IntArray
     trajectories: IntArray
@@ -273,6 +276,7 @@ class EpisodeBatch:
             returns=self.returns[steps],
             rewards=self.rewards[steps],
             log_probs=self.log_probs[steps],
+            ratios=self.ratios[steps],
             terminal_values=self.terminal_values[episodes],
             times=self.times[episodes],
             trajectories=self.trajectories[episodes],

@@ -186,6 +186,7 @@ class EpisodeRolloutBuffer(RolloutBuffer):
             returns=returns,
             rewards=self.rewards[valid].astype(np.float64),
             log_probs=self.log_probs[valid].astype(np.float64),
+            ratios=np.ones(len(values)),
             terminal_values=self._terminal_values,
             times=times,
             trajectories=self._of_segments("trajectory") * self.n_envs + self._of_segments("env"),

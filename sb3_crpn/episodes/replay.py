@@ -35,8 +35,9 @@ class Replay:
     where δ takes the present V, and the critic's target is V(s_i) + c_i Â_i (V-trace; Espeholt et
     al., IMPALA, ICML 2018, with ρ̄ = c̄ = 1 there). For π = μ these are the cost advantages
     of a fresh rollout. That μ visited the states is not corrected, as is usual (Queeney et
-    al., Generalized proximal policy optimization with sample reuse, NeurIPS 2021). A rollout is
-    dropped once its effective sample size (Σρ)²/Σρ² falls below half of its steps.
+    al., Generalized proximal policy optimization with sample reuse, NeurIPS 2021). In H a pair of
+    steps counts with the ratios of both actions. A rollout is dropped once its effective sample
+    size (Σρ)²/Σρ² falls below half of its steps.
 
     Parameters
     ----------
@@ -82,7 +83,7 @@ class Replay:
         normalize_advantage: bool,
         discount_visitation: bool,
     ) -> EpisodeBatch:
-        clipped_ratios = np.minimum(ratios, 1.0)
+        clipped_ratios, truncated = np.minimum(ratios, 1.0), np.minimum(ratios, MAX_RATIO)
         advantages = generalized_advantages(
             batch.rewards,
             values,
@@ -102,7 +103,8 @@ class Replay:
         )
         return replace(
             batch,
-            cost_advantages=np.minimum(ratios, MAX_RATIO) * costs,
+            cost_advantages=truncated * costs,
+            ratios=truncated,
             values=values,
             returns=values + clipped_ratios * advantages,
         )

@@ -119,6 +119,7 @@ def test_estimates_of_single_episodes_are_attained():
         returns=np.zeros(H),
         rewards=np.zeros(H),
         log_probs=np.zeros(H),
+        ratios=np.ones(H),
         terminal_values=np.zeros(1),
         times=np.zeros(1, dtype=int),
         trajectories=np.arange(1),

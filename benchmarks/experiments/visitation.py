@@ -1,0 +1,127 @@
+"""Training with reused rollouts, corrected for the states that the old policies visited or not.
+
+    python -m benchmarks.experiments.visitation
+
+Each environment's entry at its ``target_kl`` and at four times it, with and without the Hessian.
+Seeds from 10 on, which no table of the benchmark reports.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+from benchmarks.common.figures import PALETTE
+from benchmarks.common.intervals import interval
+from benchmarks.common.markdown import estimate, markdown
+from benchmarks.common.table import Row
+from benchmarks.experiments.study import Study
+from benchmarks.experiments.tasks import Returns, make_model
+from benchmarks.learning.settings import resolve
+from sb3_crpn.arrays import FloatArray
+from sb3_crpn.episodes import EpisodeBatch, Replay
+from sb3_crpn.episodes.batch import episode_scan
+
+BUDGETS = {"CartPole-v1": 30_000, "Acrobot-v1": 40_000, "Pendulum-v1": 40_000}
+FIRST_SEED = 10
+FACTORS = (1, 4)
+ARMS = ("none", "pairs", "visitation")
+HESSIANS = ("auto", "none")
+
+
+class Uncorrected(Replay):
+    """Reused pairs of steps have the ratio of the later action alone."""
+
+    def reweighted(self, policy: ActorCriticPolicy, **weighting: bool) -> list[EpisodeBatch]:
+        """Return the rollouts."""
+        batches = super().reweighted(policy, **weighting)
+        return [replace(batch, ratios=np.ones(batch.n_steps)) for batch in batches]
+
+
+class Visitation(Uncorrected):
+    """Steps are weighted by exp(clip(Σ_{j<i} κ^{i-j} log ρ_j, ±1)), κ = 0.95, of mean 1."""
+
+    def _reweight(
+        self, batch: EpisodeBatch, values: FloatArray, ratios: FloatArray, **weighting: bool
+    ) -> EpisodeBatch:
+        reused = super()._reweight(batch, values, ratios, **weighting)
+        logarithms = np.log(ratios)
+        past = episode_scan(logarithms, 0.95, batch.lengths) - logarithms
+        weights = np.exp(np.clip(past, -1.0, 1.0))
+        weights /= weights.mean()
+        return replace(reused, cost_advantages=weights * reused.cost_advantages)
+
+
+REPLAYS = {"none": Uncorrected, "pairs": Replay, "visitation": Visitation}
+
+
+def jobs(seeds: int) -> list[Row]:
+    """Return one job per training run."""
+    cases = itertools.product(
+        range(FIRST_SEED, FIRST_SEED + seeds), BUDGETS, FACTORS, HESSIANS, ARMS
+    )
+    return [
+        {"env": env, "factor": factor, "hessian": hessian, "arm": arm, "seed": seed}
+        for seed, env, factor, hessian, arm in cases
+        if (hessian, arm) != ("none", "pairs")  # pairs are the Hessian's
+    ]
+
+
+def measure(env: str, factor: int, hessian: str, arm: str, seed: int) -> list[Row]:
+    """Train once."""
+    target = resolve("CRPN", env, {})[1].get("target_kl", 0.02)
+    arguments: dict[str, Any] = {"target_kl": factor * target}
+    if hessian == "none":
+        arguments["hessian_shrinkage"] = 0.0
+    model = make_model(env, seed, **arguments)
+    model.replay = REPLAYS[arm](model.n_reused_rollouts, model.gamma, model.gae_lambda)
+    returns = Returns(BUDGETS[env])
+    model.learn(BUDGETS[env], callback=returns)
+    return [returns.summary()]
+
+
+def table(rows: pd.DataFrame) -> str:
+    """Return a Markdown table: mean return over training, a row per task, target and Hessian."""
+    body = []
+    for (env, factor, hessian), group in rows.groupby(["env", "factor", "hessian"], sort=False):
+        runs = [group[group.arm == arm].mean_return for arm in ARMS]
+        cells = ["-" if run.empty else estimate(interval(run), ".0f") for run in runs]
+        body.append([env, f"{factor} ×", hessian, group.seed.nunique(), *cells])
+    return markdown(["task", "target_kl", "Hessian", "seeds", *ARMS], body)
+
+
+def draw(rows: pd.DataFrame) -> Figure:
+    """Draw the mean returns; print the table."""
+    print(table(rows))
+    figure, axes = plt.subplots(1, len(BUDGETS), figsize=(9, 3), layout="constrained")
+    for axis, env in zip(axes, BUDGETS, strict=True):
+        cases = list(itertools.product(FACTORS, HESSIANS))
+        for shift, (colour, arm) in enumerate(zip(PALETTE, ARMS, strict=False)):
+            for position, (factor, hessian) in enumerate(cases):
+                chosen = (rows.env == env) & (rows.factor == factor) & (rows.hessian == hessian)
+                values = rows[chosen & (rows.arm == arm)].mean_return
+                if values.empty:
+                    continue
+                mean, low, high = interval(values)
+                axis.errorbar(
+                    position + 0.15 * (shift - 1.5), mean, [[mean - low], [high - mean]],
+                    fmt="o", ms=4, color=colour, label=arm if position == 0 else None,
+                )  # fmt: skip
+        axis.set_xticks(range(len(cases)), [f"{f} ×, {h}" for f, h in cases], fontsize=7)
+        axis.set_title(env, fontsize=9)
+    axes[0].legend(fontsize=7)
+    axes[0].set_ylabel("mean return over training")
+    return figure
+
+
+STUDY = Study("visitation", jobs, measure, draw, seeds=5)
+
+if __name__ == "__main__":
+    STUDY.main(str(__doc__))
