@@ -1,4 +1,4 @@
-"""What several ranks gain and what they cost, and a cost model for more of them.
+"""The speed-up and the cost of several ranks, and a cost model for more ranks.
 
 OMP_NUM_THREADS=1 torchrun --standalone --nproc-per-node 2 -m benchmarks.distributed
 python -m benchmarks.distributed --table
@@ -37,7 +37,7 @@ RESULTS = Parts(Path(__file__).with_suffix(".csv"))
 MODES = ("one process", "all ranks")
 # Fisher and Hessian products in one timing
 N_PRODUCTS = 5
-# float64 numbers in the reductions that are timed, and how often each is
+# Sizes of the timed reductions in float64 numbers, and their repetitions
 SIZES, REPEATS = (1, 1_000, 10_000, 100_000, 1_000_000), 50
 RANKS = (2, 8, 64, 512)
 
@@ -153,7 +153,7 @@ def reductions() -> list[Row]:
 
 
 def tables(results: dict[str, list[Row]]) -> Iterator[str]:
-    """Yield what was measured and what follows from it, a paragraph or a table each."""
+    """Yield the measurements and the cost model, a paragraph or a table each."""
     (case,) = results["circumstances"]
     yield (
         f"{case['env']}, {case['episodes']} episodes of {case['timesteps']} timesteps in all an "
@@ -194,7 +194,7 @@ def _quartiles(one: list[float], many: list[float]) -> Estimate:
 
 
 class Ring(NamedTuple):
-    """What messages cost that go round a ring of processes.
+    """The cost of messages in a ring of processes.
 
     A reduction by a ring of W ranks takes 2(W - 1) hops, each with 1/W of the bytes. Each message
     costs the same besides, whatever W: packing it, waking up, a minibatch too small to be
@@ -211,7 +211,7 @@ class Ring(NamedTuple):
     per_message: float = 0.0
 
     def seconds(self, number: float, total_bytes: float, n_ranks: int) -> float:
-        """Return what so many messages cost."""
+        """Return the cost of the messages."""
         hops = 2 * (n_ranks - 1)
         reducing = number * hops * self.per_hop + total_bytes * hops / n_ranks * self.per_byte
         return number * self.per_message + reducing
@@ -264,7 +264,7 @@ def model_tables(
 
 
 def main() -> None:
-    """Measure under torchrun, or print what was measured."""
+    """Measure under torchrun, or print the measurements."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--env", default="HalfCheetah-v5")
     parser.add_argument("--n-envs", type=int, default=4, help="in all")

@@ -69,7 +69,7 @@ def pages() -> Iterator[Path]:
 
 
 def render(text: str) -> str:
-    """Return a page with all its tables made anew."""
+    """Return a page with all its tables generated again."""
     return BLOCK.sub(lambda block: f"{block[1]}{TABLES[block[2]]()}\n{block[3]}", text)
 
 

@@ -42,7 +42,7 @@ N_ENVS = (1, 8, 16, 64)
 
 
 class Level(NamedTuple):
-    """A mean return, and of how many episodes."""
+    """A mean return, and its number of episodes."""
 
     mean_return: float
     episodes: int = 100

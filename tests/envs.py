@@ -1,4 +1,4 @@
-"""Tiny environments: a walk without randomness of its own, any space, and faults on demand."""
+"""Small environments: a deterministic walk, arbitrary spaces, and injected faults."""
 
 import gymnasium as gym
 import numpy as np
@@ -37,7 +37,7 @@ class Drift(gym.Env):
 
 
 class Sampler(gym.Env):
-    """Random observations and rewards that ask for large actions, over any spaces."""
+    """Random observations of any space, and rewards that grow with the size of the action."""
 
     def __init__(self, observation_space, action_space, length=4):
         self.observation_space, self.action_space = observation_space, action_space
@@ -57,7 +57,7 @@ class Sampler(gym.Env):
 
 
 class Faulty(gym.Wrapper):
-    """``fault(observation, reward, *rest)`` stands in for the outcome of step number ``at``."""
+    """``fault(observation, reward, *rest)`` replaces the outcome of step number ``at``."""
 
     def __init__(self, env, at, fault):
         super().__init__(env)

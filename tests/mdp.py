@@ -11,7 +11,7 @@ from sb3_crpn import CRPN, PAPER
 
 
 def random_mdp(seed, horizon=4, *, fixed_length=False):
-    """Three states, two actions; episodes of H steps, or such as may end before."""
+    """Three states, two actions, and episodes of at most H steps."""
     max_stop = 0.0 if fixed_length else 0.5
     return exact.random_mdp(seed, n_states=3, horizon=horizon, gamma=0.8, max_stop=max_stop)
 
@@ -36,7 +36,7 @@ def random_parameters(mdp, seed=0):
 
 
 def differs(samples, truth, level=1e-6):
-    """Whether the mean of independent samples [n, …] is not ``truth``, entry by entry.
+    """Return whether the mean of independent samples [n, …] differs from ``truth`` significantly.
 
     A two-sided t-test with Bonferroni's correction for the number of entries.
     """

@@ -1,4 +1,4 @@
-"""The paper's estimators, written out episode by episode in float64 with nothing but autograd."""
+"""The paper's estimators, computed episode by episode in float64 by autograd."""
 
 import copy
 from itertools import pairwise

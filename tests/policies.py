@@ -1,4 +1,4 @@
-"""Small float64 policies and frozen episodes, and their scores written out one by one."""
+"""Small float64 policies, fixed episodes, and their scores computed one by one."""
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ ACTION_SPACES = {
 
 
 class Features(FlattenExtractor):
-    """x ↦ Px in the policy's own precision; SB3's extractors hand on float32."""
+    """x ↦ Px in the policy's precision. SB3's extractors return float32."""
 
     def __init__(self, observation_space, mixing=None):
         super().__init__(observation_space)
@@ -51,7 +51,7 @@ def small_policy(kind, *, net_arch=(3,), dtype=torch.float64, mixing=None):
 
 
 def frozen_episodes(policy, lengths=(3, 1, 4, 2), seed=0):
-    """Random observations, actions of the policy, and weights A_i drawn from the normal law."""
+    """Random observations, actions of the policy, and normally distributed cost advantages A_i."""
     rng = np.random.default_rng(seed)
     n_steps = sum(lengths)
     observations = torch.from_numpy(rng.normal(size=(n_steps, 2))).float()

@@ -1,4 +1,4 @@
-"""Functions run on several ranks, in processes of their own."""
+"""Functions that run on several ranks, one process each."""
 
 import os
 import socket

@@ -1,4 +1,4 @@
-"""ACRPN as the paper's Algorithm 2: its three branches and its early end."""
+"""ACRPN as the paper's Algorithm 2: its three branches and its early termination."""
 
 import math
 

@@ -12,8 +12,10 @@ import sb3_crpn
 PACKAGE = Path(sb3_crpn.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_FUNCTION_LINES = 40
+# Layers in which each module has the test file of its name
+TESTED_BY_MODULE = {"cubic", "curvature", "episodes", "sosp", "theory"}
 
-# From bottom to top; a module imports from those before it alone
+# From bottom to top. A module imports from the layers before it only
 GROUND = {"checks", "arrays"}
 LAYERS = {
     "cli": set(),
@@ -59,12 +61,12 @@ THIRD_PARTY = {
 
 
 def layer_of(path):
-    """The module that a file belongs to: its folder's name where it is in one."""
+    """The layer of a file: the name of its folder, or of the file outside folders."""
     return path.relative_to(PACKAGE).with_suffix("").parts[0]
 
 
 def imports(source, package):
-    """The dotted names that ``source``, of a module in ``package``, imports."""
+    """The dotted names of the imports of ``source``, a module in ``package``."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -78,7 +80,7 @@ def imports(source, package):
 
 
 def violations(layer, names):
-    """Those of the imported ``names`` that a module of ``layer`` may not import."""
+    """The imported ``names`` that a module of ``layer`` may not import."""
     third_party = THIRD_PARTY.get(layer, ARRAYS | SB3)
     for name in names:
         root, *rest = name.split(".")
@@ -91,7 +93,7 @@ def violations(layer, names):
 
 
 def test_importing_the_package_leaves_slow_modules_out():
-    """They take a second, and few calls need them."""
+    """Modules that take a second to import and that few calls need."""
     code = "import sys; from sb3_crpn import CRPN; print(*sys.modules)"
     loaded = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
@@ -166,3 +168,14 @@ def test_functions_are_short(path):
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_files_are_short(path):
     assert len(path.read_text().splitlines()) <= 300
+
+
+MIRRORED = [
+    path for path in FILES if layer_of(path) in TESTED_BY_MODULE and path.stem != "__init__"
+]
+
+
+@pytest.mark.parametrize("path", MIRRORED, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_every_module_has_its_test_file(path):
+    folder = Path(__file__).parent / path.relative_to(PACKAGE).parent
+    assert (folder / f"test_{path.stem.strip('_')}.py").is_file()

@@ -1,4 +1,4 @@
-"""Generated calls with one bad argument: each is an error that names the argument."""
+"""Generated calls with one bad argument. Each raises an error that names the argument."""
 
 import inspect
 import random
@@ -35,7 +35,7 @@ NAN, INF = float("nan"), float("inf")
 
 
 def _drawn(rng):
-    """A value that no argument allows, of a type drawn at random."""
+    """A value of a random type that no argument allows."""
     return rng.choice(
         (
             lambda: -rng.uniform(1.5, 9.0),
@@ -99,7 +99,7 @@ CALLS = {
     CRPN.estimate_curvature: {"n_episodes": 2},
 }
 OPTIONS = ("confidence", "interval", "bounds", "n_eigenvalues", "n_probes", "progress_bar")
-# Words, whatever they are, are paths; environments are SB3's to judge
+# Every string is a valid path. SB3 checks environments
 FREE = {"self", "env", "tensorboard_log", "save_path"}
 
 

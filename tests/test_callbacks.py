@@ -14,7 +14,7 @@ from tests.training import make, same, several, tensors
 
 
 class Iterates(BaseCallback):
-    """All iterates θ_0, θ_1, …: what the reservoir does without."""
+    """Records all iterates θ_0, θ_1, …, which the reservoir does not."""
 
     def __init__(self):
         super().__init__()
@@ -75,7 +75,7 @@ def test_it_keeps_the_iterate_after_the_drawn_update(model):
 
 
 def draw(model, alphas, seed):
-    """R after updates with the given α, through the hooks that training calls."""
+    """R after updates with the given α, by the hooks that training calls."""
     callback = RandomIterateCallback(seed=seed)
     callback.init_callback(model)
     callback.on_training_start({}, {})

@@ -1,4 +1,4 @@
-"""Checks of arguments: what they take, what they make of it, and what they say."""
+"""Checks of arguments: allowed values, conversions and messages."""
 
 import numpy as np
 import pytest

@@ -69,7 +69,7 @@ class States(BaseCallback):
     ids=lambda space: type(space).__name__,
 )
 def test_target_kl_is_met_within_ten_per_cent(algorithm, metric, actions):
-    """Judged by the policies themselves. With H = 0 any divergence is within reach."""
+    """The divergence is computed from the policies. With H = 0 every divergence can be met."""
     log, states = TrainLog(), States()
     env = Sampler(NUMBERS, actions)
     settings = {"metric": metric, "hessian_shrinkage": 0.0, "n_episodes": 8}
@@ -121,7 +121,7 @@ def test_fixed_alpha_follows_its_schedule(algorithm, metric):
 
 @both
 def test_schedules_end_where_whole_episodes_overrun_the_last_timestep(algorithm):
-    """40 steps an update: the last one ends at -1 of the progress."""
+    """40 steps an update. The last one ends at a remaining progress of -1."""
     log = TrainLog()
     env = Drift(bound=np.inf, limit=10)
     linear = {"alpha": lambda progress: 1.0 + progress, "learning_rate": lambda progress: progress}
@@ -131,7 +131,7 @@ def test_schedules_end_where_whole_episodes_overrun_the_last_timestep(algorithm)
 
 
 class Batches:
-    """Records the batches that curvature is estimated from."""
+    """Records the batches of the curvature estimates."""
 
     def __init__(self, monkeypatch):
         self.sizes, self.observations, self.of_fisher = [], [], []
@@ -171,7 +171,7 @@ def test_batch_sizes(algorithm, m, b, monkeypatch):
 @both
 @pytest.mark.parametrize("rising", [True, False])
 def test_scheduled_batch_sizes(algorithm, rising, monkeypatch):
-    """The numbers that an update simulates are the ones it uses."""
+    """An update uses the batch sizes of its simulation."""
     batches, log = Batches(monkeypatch), TrainLog()
 
     def n_episodes(progress):
@@ -402,7 +402,7 @@ def test_paper_settings_are_algorithm_1(solver, limit, alpha, dim):
 
 @METRICS
 def test_solvers_agree(metric):
-    """Dense and Krylov steps are one where the Krylov space is all of ℝᵈ."""
+    """Dense and Krylov steps are equal if the Krylov space is ℝᵈ."""
     steps = []
     for settings in ({"solver": "dense"}, {"solver": "krylov", "krylov_dim": 1000}):
         model = make(CRPN, net_arch=[], metric=metric, hessian_shrinkage=0.5, **settings)
@@ -497,7 +497,7 @@ class Estimate(BaseCallback):
 
 @both
 def test_estimate_curvature_in_mid_rollout(algorithm):
-    """The training environment is busy; another one is free to use, between rollouts any is."""
+    """In mid-rollout another environment is needed. Between rollouts any environment is allowed."""
     with pytest.raises(RuntimeError, match="env="):
         make(algorithm).learn(30, Estimate("_on_step"))
     for callback in (Estimate("_on_step", several(2)), Estimate("_on_rollout_end")):

@@ -1,4 +1,4 @@
-"""docs/EXTENDING.md, followed: variants defined here are trained with, saved and loaded."""
+"""The recipes of docs/EXTENDING.md: models with these variants train, save and load."""
 
 import copy
 import inspect
@@ -42,7 +42,7 @@ class AbsoluteHessian:
 
 
 class Diagonal:
-    """W_ij = A_i δ_ij: no cross-time terms, `Causal(0.0)` written out."""
+    """W_ij = A_i δ_ij: no cross-time terms, as `Causal(0.0)`."""
 
     def apply(self, cost_advantages, lengths, u):
         return cost_advantages.reshape(-1, *[1] * (u.ndim - 1)) * u
@@ -86,7 +86,7 @@ class AtLeast(EpisodeTracker):
 
 @configured
 class MyCRPN(CRPN):
-    """CRPN whose target is halved every so many updates.
+    """CRPN with a target that is halved every ``halve_every`` updates.
 
     {parameters}
     """

@@ -1,4 +1,4 @@
-"""Whatever happens, the policy stays usable, can be saved, and goes on."""
+"""After any failure the policy is unchanged, can be saved and continues training."""
 
 import os
 from dataclasses import replace
@@ -21,7 +21,7 @@ NAN, INF = float("nan"), float("inf")
 
 
 class CrashError(Exception):
-    """Stands for anything that goes wrong."""
+    """An arbitrary failure."""
 
 
 def with_reward(value, observation, reward, *rest):
@@ -41,7 +41,7 @@ def die(*outcome):
 
 
 def goes_on(model, earlier, path):
-    """The policy is as before; the model saves, loads and learns on in a good environment."""
+    """Assert that the policy is unchanged, and that the model saves, loads and learns."""
     assert same(model, earlier)
     model.save(path)
     loaded = type(model).load(path, env=several(1), device="cpu")
@@ -148,7 +148,7 @@ def test_exception_in_a_callback(algorithm, where, error, tmp_path):
 @both
 @pytest.mark.parametrize("trial", [1, 3])
 def test_interrupt_while_steps_are_tried(algorithm, trial, monkeypatch, tmp_path):
-    """The actor is moved to each trial step; an interrupt must not leave it there."""
+    """A trial step changes the actor. An interrupt restores it."""
     model = make(algorithm, target_kl=0.02).learn(20)
     earlier, evaluate, calls = tensors(model), CandidateEvaluator.evaluate, []
 
@@ -157,7 +157,7 @@ def test_interrupt_while_steps_are_tried(algorithm, trial, monkeypatch, tmp_path
         evaluation = evaluate(self, step)
         if len(calls) == trial:
             raise KeyboardInterrupt
-        # too long, so that another trial follows
+        # a too long step, so that another trial follows
         return replace(evaluation, kl=1.0)
 
     monkeypatch.setattr(CandidateEvaluator, "evaluate", failing)
@@ -169,7 +169,7 @@ def test_interrupt_while_steps_are_tried(algorithm, trial, monkeypatch, tmp_path
 
 @both
 def test_the_rollout_of_a_step_that_is_not_finite_is_not_reused(algorithm, monkeypatch):
-    """What spoilt one step would spoil the next ones."""
+    """A cause that makes one step non-finite persists in the next updates."""
     model, log, evaluate = make(algorithm, n_episodes=3), TrainLog(), CandidateEvaluator.evaluate
 
     def first_fails(self, step):
@@ -230,7 +230,7 @@ FROM_RETURNS = {"baseline": False, "bootstrap_truncated": False, "gae_lambda": 1
 @both
 @SETTINGS
 def test_zero_rewards(algorithm, settings):
-    """With g = 0, exactly so before the critic's rounding comes in, there is no step to take."""
+    """With g = 0, which holds exactly for a critic without rounding, the step is 0."""
     log = TrainLog()
     model = make(algorithm, Rewards(Drift(), 0.0), **(settings | FROM_RETURNS))
     model.learn(60, log)
@@ -265,7 +265,7 @@ def test_episodes_of_a_single_step(algorithm, actions):
 
 @both
 def test_a_single_episode(algorithm):
-    """Neither noise nor shrinkage can be measured, and the step is a first-order one."""
+    """Noise and shrinkage cannot be estimated. The step is of first order."""
     log = TrainLog()
     model = make(algorithm, n_episodes=1, n_reused_rollouts=0).learn(30, log)
     assert np.isnan(log["gradient_noise"]).all()
@@ -279,7 +279,7 @@ def test_a_single_episode(algorithm):
     ("log_std", "what"), [(-25.0, "(a product|a projected matrix)"), (-40.0, "the gradient")]
 )
 def test_derivatives_that_overflow(algorithm, settings, log_std, what):
-    """Nor does the linear algebra's own error, which no tuner prunes, get out."""
+    """An error of the linear algebra, which no tuner handles, is caught too."""
     model = make(algorithm, Drift(dim=1), policy_kwargs={"log_std_init": log_std}, **settings)
     before = tensors(model)
     with pytest.raises(ValueError, match=f"{what} is not finite.* raise alpha, or set target_kl"):

@@ -1,4 +1,4 @@
-"""The same on a GPU as on the CPU."""
+"""Results on a GPU equal those on the CPU."""
 
 import itertools
 from dataclasses import replace
@@ -35,7 +35,7 @@ pytestmark = [
 
 
 def measured(kind, device):
-    """All that an update makes of frozen episodes, brought to the CPU."""
+    """All results of an update from fixed episodes, on the CPU."""
     policy, _ = small_policy(kind)
     batch = frozen_episodes(policy, lengths=(3, 1, 4, 2, 5))
     policy.to(device)
@@ -116,14 +116,14 @@ def test_a_loaded_model_goes_on_with_the_noise_where_it_stopped(tmp_path):
 
 
 def on_a_shared_gpu(folder):
-    """What this rank has learnt after some updates."""
+    """The parameters of this rank after some updates."""
     assert dist.get_backend() == "gloo"  # two ranks of one GPU
     model = make(CRPN, several(2), device="cuda").learn(400)
     return model._n_updates, model.actor.vector.cpu(), model.num_timesteps
 
 
 def nccl_messages(folder):
-    """Reduce and broadcast what ranks send, over NCCL, with this process the only rank."""
+    """Reduce and broadcast over NCCL with a single rank."""
     torch.cuda.set_device(0)
     dist.init_process_group("cpu:gloo,cuda:nccl", rank=0, world_size=1)
     results = []

@@ -64,7 +64,7 @@ def test_frozen_tensors_are_left_out():
 
 
 class Renamed(ActorCriticPolicy):
-    """Its actor reads a tensor named after the value, and an unused layer of the actor's name."""
+    """The actor reads a tensor named after the value. A layer named after the actor is unused."""
 
     def _build(self, lr_schedule):
         super()._build(lr_schedule)

@@ -1,4 +1,4 @@
-"""What Stable-Baselines3 promises of an algorithm: spaces, policies, wrappers, callbacks, files."""
+"""The contract of a Stable-Baselines3 algorithm: spaces, policies, wrappers, callbacks, files."""
 
 from functools import partial
 from pathlib import Path
@@ -107,7 +107,7 @@ def policy_for(observation_space):
 
 
 def trains(model, timesteps=24):
-    """Train for some updates; the actor has moved, and so has the critic."""
+    """Train for some updates, and assert that actor and critic have changed."""
     theta, earlier = model.actor.vector, tensors(model)
     model.learn(timesteps)
     now = model.policy.state_dict()
@@ -442,7 +442,7 @@ SAVED = [
 
 
 def trajectory(algorithm, learn, **settings):
-    """Train a fresh model with ``learn`` and return it with all of its state."""
+    """Train a new model with ``learn`` and return it with its state."""
     model = make(algorithm, several(2, dim=2), **(PER_UPDATE | settings))
     model = learn(model)
     optimizer = model.policy.optimizer.state_dict()["state"]

@@ -32,7 +32,7 @@ WRAPPERS = {
     "VecMonitor": VecMonitor,
     "all": lambda env: VecMonitor(VecNormalize(VecFrameStack(VecCheckNan(env), 2))),
 }
-# What each wrapper can do: frames are stacked, and moments kept, of numbers alone
+# The spaces of each wrapper: only numbers are stacked and normalised
 NUMBERS = ("Box", "image, channels last", "image, channels first")
 SPACES_OF = {
     "none": tuple(OBSERVATIONS),
@@ -45,7 +45,7 @@ SPACES_OF = {
 
 
 def cells():
-    """Every wrapper with and without Monitor and with both rollouts; the spaces take turns."""
+    """Every wrapper with and without Monitor and with both rollouts, and each space in turn."""
     for number in range(4 * len(WRAPPERS)):
         wrapper = list(WRAPPERS)[number // 4]
         spaces_of = SPACES_OF[wrapper]
@@ -81,7 +81,7 @@ def test_wrappers_that_watch_change_nothing(wrapper, rollout):
 
 @rollouts
 def test_stacked_frames_are_those_of_the_environment(rollout):
-    """Also after the end of an episode, whose last frames are bootstrapped with."""
+    """Also after an episode's end, where the last stacked frames are bootstrapped."""
 
     def stacked():
         return FlattenObservation(FrameStackObservation(Drift(), 2, padding_type="zero"))
@@ -103,7 +103,7 @@ def test_subprocesses_are_as_good(start_method):
 
 @both
 def test_set_env_with_another_number_of_environments(algorithm):
-    """SB3 refuses it; loading with another number is the way."""
+    """SB3 rejects another number of environments, except in ``load``."""
     model = make(algorithm, several(2)).learn(30)
     with pytest.raises(AssertionError, match="number of environments"):
         model.set_env(several(3))
@@ -130,7 +130,7 @@ def test_custom_objects(algorithm, tmp_path):
 @rollouts
 @pytest.mark.parametrize("factor", [1.0, 1e-25])
 def test_numpy_that_raises(algorithm, rollout, factor):
-    """Also where powers of the discount factor underflow, which means 0."""
+    """Also where powers of the discount factor underflow to 0."""
     with np.errstate(all="raise"):
         env = VecNormalize(DummyVecEnv([lambda: Rewards(Drift(limit=40, bound=9), factor)] * 2))
         model = make(algorithm, env, rollout=rollout, gamma=1e-9, n_steps=80).learn(160)

@@ -1,4 +1,4 @@
-"""Environments and adapters as users bring them: each is learnt from as its clean twin is."""
+"""Environments and adapters of users. Learning equals that from a clean equivalent."""
 
 import re
 
@@ -19,7 +19,7 @@ TAXI = max(name for name in gym.registry if re.fullmatch(r"Taxi-v\d", name))
 
 
 class Adapter(VecEnvWrapper):
-    """Changes what the environments return as adapters around other libraries do."""
+    """Changes the outcomes of environments, as adapters of other libraries do."""
 
     def __init__(self, venv, change):
         super().__init__(venv)
@@ -115,7 +115,7 @@ class Pythonic(gym.Env):
 
 @pytest.mark.parametrize("kind", Pythonic.SPACES)
 def test_observations_of_pythons_types_at_a_time_limit(kind):
-    """The terminal observation, whose value is bootstrapped, is what the environment returned."""
+    """The bootstrapped terminal observation is that of the environment."""
     policy = "MultiInputPolicy" if kind == "dict" else "MlpPolicy"
 
     def train(arrays):
@@ -139,7 +139,7 @@ def test_toy_text(algorithm, env_id):
 
 
 class Pool:
-    """A pool of environments as EnvPool has it: batched, and none of SB3's queries."""
+    """A pool of environments as in EnvPool: batched, without SB3's query methods."""
 
     def __init__(self, n_envs):
         self._env = several(n_envs)
@@ -158,10 +158,10 @@ class Pool:
 
 
 class PoolAdapter(VecEnvWrapper):
-    """EnvPool's example for SB3, in short: a wrapper around what is no ``VecEnv``."""
+    """EnvPool's example for SB3, shortened: a wrapper of an object that is no ``VecEnv``."""
 
     def seed(self, seed=None):
-        """A pool is seeded when it is made."""
+        """A pool is seeded at its construction."""
 
     def reset(self):
         return self.venv.reset()

@@ -1,4 +1,4 @@
-"""Policies as users change them: replaced, frozen, unfrozen, copied, interrupted."""
+"""Policies that users replace, freeze, unfreeze, copy or interrupt."""
 
 import copy
 from pathlib import Path
@@ -87,7 +87,7 @@ def divergence(old, new, observations):
 
 @both
 def test_unfrozen_layers_move_within_the_bound(algorithm):
-    """They are the actor's from then on, which the critic's fit leaves alone."""
+    """Unfrozen layers belong to the actor. The critic's fit does not change them."""
     model = shared(algorithm, n_critic_updates=50, learning_rate=0.05)
     layer = model.policy.features_extractor.first
     layer.requires_grad_(False)
@@ -123,7 +123,7 @@ def test_frozen_layers_stay_bit_for_bit(algorithm, when, tmp_path):
 
 
 class Masked(ActorCriticPolicy):
-    """The observation says which actions are valid; at zeros none is."""
+    """The observation is the mask of valid actions. No action is valid at zeros."""
 
     def get_distribution(self, observations):
         distribution = super().get_distribution(observations)
@@ -270,7 +270,7 @@ PLACES = {
 
 @pytest.mark.parametrize("place", PLACES)
 def test_an_interrupt_changes_the_policy_as_a_whole_or_not_at_all(place, monkeypatch):
-    """Autograd, which ``torch.no_grad`` leaves switched off then, is on again."""
+    """Autograd is enabled again, although ``torch.no_grad`` was interrupted."""
     owner, name = PLACES[place]
     function = getattr(owner, name)
 
@@ -331,7 +331,7 @@ def test_dictionaries_of_observations_find_the_same_actor():
 
 
 class Hook(BaseCallback):
-    """Does something once, at the 20th step."""
+    """Calls a function once, at the 20th step."""
 
     def __init__(self, action):
         super().__init__()

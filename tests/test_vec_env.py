@@ -22,7 +22,7 @@ N_ENVS = 4
 
 
 class Walk(gym.Env):
-    """A random walk: all that SB3 may see (first and last observations, infos) is told apart."""
+    """A random walk with unique first and last observations and infos."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 7}  # noqa: RUF012
     render_mode = "rgb_array"
@@ -66,7 +66,7 @@ class Walk(gym.Env):
         info = {"x": self.x, "pair": np.array([self.x, self.steps]), "deep": {"steps": self.steps}}
         if self.steps % 2:
             info["odd"] = f"step {self.steps}"
-        # ``truncated`` also together with ``terminated``, which is no time limit
+        # ``truncated`` together with ``terminated`` is no time limit
         terminated, truncated = abs(self.x) > 2.0, self.steps >= self.limit
         return self._observe(), self.x, terminated, truncated or self.x > 2.5, info
 
@@ -435,7 +435,7 @@ def test_evaluate_policy_reports_episode_statistics():
 
 
 def test_throughput_on_cartpole():
-    """The aim is 5; 3 leaves room for a busy machine."""
+    """The target is 5. The threshold of 3 allows for a busy machine."""
     num_envs = 64
     actions = np.random.default_rng(0).integers(2, size=(40, num_envs))
     adapted = GymnasiumVecEnv(make_cartpole(num_envs))

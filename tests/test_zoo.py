@@ -44,6 +44,17 @@ hyperparams = {{
     }}
 }}
 """
+# An entry that asks for timesteps in place of episodes
+TIMESTEPS = f"""
+{ENV}:
+  n_envs: 3
+  n_timesteps: 300
+  policy: MlpPolicy
+  normalize: true
+  gamma: 0.9
+  rollout: timesteps
+  n_steps: 50
+"""
 
 
 def run(command, folder, **environment):
@@ -62,43 +73,49 @@ def run(command, folder, **environment):
     return done.stdout
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
-def test_scripts_run_from_the_source_tree(algo, tmp_path):
-    # one test, so that one xdist worker makes the runs that the checks share
+def source_tree_lines(algo):
+    """Training, going on, enjoying, plotting and a search, in the order of the runs' numbers."""
     train = f"train --algo {algo} --env {ENV}"
     enjoy = f"enjoy --algo {algo} --env {ENV} -f logs --no-render -n 200"
     curves = "-n 800 --eval-freq 400 --eval-episodes 2"
     search = "-optimize -n 200 --n-trials 1 --eval-episodes 1 --no-optim-plots"
-    study = "--storage study.log --study-name study"
+    study = f"--storage {algo}.log --study-name study"
+    return [
+        f"{train} {SMALL} {curves} --save-freq 400 --tensorboard-log tensorboard_{algo}",
+        f"{train} {SMALL} {curves} -i logs/{algo}/{ENV}_1/{ENV}.zip",
+        f"{enjoy} --exp-id 1 --load-best",
+        f"{enjoy} --exp-id 1 --load-checkpoint 400",
+        f"plot_train -a {algo} -e {ENV} -f logs -w 2",
+        f"all_plots -a {algo} -e {ENV} -f logs -o results_{algo} --no-display",
+        f"plot_from_file -i results_{algo} -o figure_{algo} --format png",
+        f"{train} {search} {study} --seed 1",
+        f"{train} {search} {study} --seed 2",
+        f"{train} {study} -n 200 --trial-id 1",
+        f"{train} -n 200 --conf-file config.py",
+        f"{enjoy} --stochastic",
+        f"{train} --conf-file timesteps.yml --eval-freq -1 --device cpu",
+    ]
+
+
+def test_scripts_run_from_the_source_tree(tmp_path):
+    # one test, so that one xdist worker makes the runs that the checks share, and two processes,
+    # for importing rl_zoo3 and what it needs takes as long as these runs
     (tmp_path / "config.py").write_text(SCHEDULES)
-    first = f"{train} {SMALL} {curves} --save-freq 400 --tensorboard-log tensorboard"
+    (tmp_path / "timesteps.yml").write_text(TIMESTEPS)
+    first, *lines = [line for algo in ALGORITHMS for line in source_tree_lines(algo)]
     output = run([sys.executable, "-m", "sb3_crpn.zoo", *first.split()], tmp_path)
-    assert f"Loading hyperparameters from: {config_file(algo)}" in output
-    output = run(
-        [
-            *(sys.executable, "-c", CHAIN),
-            f"{train} {SMALL} {curves} -i logs/{algo}/{ENV}_1/{ENV}.zip",
-            f"{enjoy} --exp-id 1 --load-best",
-            f"{enjoy} --exp-id 1 --load-checkpoint 400",
-            f"plot_train -a {algo} -e {ENV} -f logs -w 2",
-            f"all_plots -a {algo} -e {ENV} -f logs -o results --no-display",
-            "plot_from_file -i results -o figure --format png",
-            f"{train} {search} {study} --seed 1",
-            f"{train} {search} {study} --seed 2",
-            f"{train} {study} -n 200 --trial-id 1",
-            f"{train} -n 200 --conf-file config.py",
-            f"{enjoy} --stochastic",
-        ],
-        tmp_path,
-    )
-    runs = {number: tmp_path / "logs" / algo / f"{ENV}_{number}" for number in (1, 2, 5, 6)}
-    check_training(algo, runs[1])
-    assert list(tmp_path.glob(f"tensorboard/{ENV}/*/events.out.tfevents.*"))
-    check_continuation(algo, runs[1], runs[2])
-    check_enjoy(algo, output)
-    assert (tmp_path / "figure").read_bytes().startswith(b"\x89PNG")
-    check_search(algo, tmp_path / "study.log", runs[5])
-    check_schedules(algo, runs[6])
+    output += run([sys.executable, "-c", CHAIN, *lines], tmp_path)
+    for algo in ALGORITHMS:
+        assert f"Loading hyperparameters from: {config_file(algo)}" in output
+        runs = {number: tmp_path / "logs" / algo / f"{ENV}_{number}" for number in (1, 2, 5, 6, 7)}
+        check_training(algo, runs[1])
+        assert list(tmp_path.glob(f"tensorboard_{algo}/{ENV}/*/events.out.tfevents.*"))
+        check_continuation(algo, runs[1], runs[2])
+        check_enjoy(algo, output)
+        assert (tmp_path / f"figure_{algo}").read_bytes().startswith(b"\x89PNG")
+        check_search(algo, tmp_path / f"{algo}.log", runs[5])
+        check_schedules(algo, runs[6])
+        check_timesteps(algo, runs[7])
 
 
 def load(algo, folder):
@@ -132,8 +149,8 @@ def check_enjoy(algo, output):
     """The best model, a checkpoint and the last model, one episode each."""
     for model in (f"{ENV}_1/best_model", f"{ENV}_1/rl_model_400_steps", f"{ENV}_6/{ENV}"):
         assert f"Loading logs/{algo}/{model}.zip" in output
-    assert output.count("Loading running average") == 2
-    assert output.count("1 Episodes") == 3
+    assert output.count("Loading running average") == 2 * len(ALGORITHMS)
+    assert output.count("1 Episodes") == 3 * len(ALGORITHMS)
 
 
 def check_search(algo, log, folder):
@@ -156,6 +173,14 @@ def check_schedules(algo, folder):
     assert (model.alpha(0.5), model.n_episodes(0.5)) == (55.0, 1.5)
 
 
+def check_timesteps(algo, folder):
+    """Two updates of 150 timesteps; no episode of 200 has ended in the first one."""
+    model = load(algo, folder)
+    assert model.rollout == "timesteps"
+    assert model.num_timesteps == 300
+    assert model._n_updates == 2
+
+
 @pytest.fixture
 def site(tmp_path):
     """The folder that a wheel, built from the source distribution, is installed in."""
@@ -175,15 +200,16 @@ def test_scripts_run_from_a_wheel(site, tmp_path):
     )
     assert f"Loading hyperparameters from: {site}/sb3_crpn/zoo_configs/crpn.yml" in output
     search = "-optimize -n 200 --n-trials 1 --eval-episodes 1 --no-optim-plots"
-    lines = [SHORT.format("acrpn")]
-    for algo in ALGORITHMS:
-        common = f"--algo {algo} --env {ENV}"
-        lines += [f"enjoy {common} -f logs --no-render -n 200", f"train {common} {search}"]
-    lines.append(f"all_plots -a crpn acrpn -e {ENV} -f logs -o results --no-display")
+    lines = [
+        SHORT.format("acrpn"),
+        *(f"enjoy --algo {algo} --env {ENV} -f logs --no-render -n 200" for algo in ALGORITHMS),
+        f"train --algo acrpn --env {ENV} {search}",
+        f"all_plots -a crpn acrpn -e {ENV} -f logs -o results --no-display",
+    ]
     output = run([sys.executable, "-c", CHAIN, *lines], tmp_path, **path)
     assert output.startswith(f"{site}/sb3_crpn/__init__.py")
     assert f"Loading hyperparameters from: {site}/sb3_crpn/zoo_configs/acrpn.yml" in output
-    assert output.count("1 Episodes") == output.count("Best trial:") == 2
+    assert (output.count("1 Episodes"), output.count("Best trial:")) == (2, 1)
     assert (tmp_path / "results.pkl").stat().st_size > 0
 
 
@@ -214,26 +240,3 @@ def test_unknown_scripts_are_named(capsys):
         main(["fly"])
     assert stop.value.code == 2
     assert "plot_from_file" in capsys.readouterr().err
-
-
-TIMESTEPS = f"""
-{ENV}:
-  n_envs: 3
-  n_timesteps: 300
-  policy: MlpPolicy
-  normalize: true
-  gamma: 0.9
-  rollout: timesteps
-  n_steps: 50
-"""
-
-
-def test_an_entry_may_ask_for_timesteps(tmp_path):
-    (tmp_path / "timesteps.yml").write_text(TIMESTEPS)
-    line = f"train --algo crpn --env {ENV} -conf timesteps.yml --eval-freq -1 --device cpu"
-    run([sys.executable, "-c", CHAIN, line], tmp_path)
-    model = load("crpn", tmp_path / f"logs/crpn/{ENV}_1")
-    assert model.rollout == "timesteps"
-    # two updates of 150 timesteps; no episode of 200 has ended in the first one
-    assert model.num_timesteps == 300
-    assert model._n_updates == 2

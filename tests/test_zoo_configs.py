@@ -51,7 +51,7 @@ def test_every_entry_says_whether_it_was_tuned(algo):
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_normalised_rewards_are_discounted_as_the_algorithm_does(algo):
-    # rl_zoo3 hands gamma on to VecNormalize only where it is written
+    # rl_zoo3 passes gamma to VecNormalize only if the entry has it
     assert all("gamma" in entry for entry in entries(algo).values() if entry.get("normalize"))
 
 

@@ -1,4 +1,4 @@
-"""Small models and what tests look at in them."""
+"""Small models, and the state that tests compare."""
 
 import pytest
 import torch
@@ -32,12 +32,12 @@ def monitored(n_envs=1, *, early_resets=True, **arguments):
 
 
 def tensors(model):
-    """Return copies of all that the policy consists of."""
+    """Return copies of the policy's tensors."""
     return {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
 
 
 def same(model, earlier):
-    """Whether the policy is bit for bit the one that ``tensors`` returned."""
+    """Return whether the policy's tensors equal those that ``tensors`` returned, bit for bit."""
     now = model.policy.state_dict()
     return all(torch.equal(now[name], tensor) for name, tensor in earlier.items())
 
@@ -47,7 +47,7 @@ def all_finite(model):
 
 
 class TrainLog(BaseCallback):
-    """Keeps what each update logged under ``train/``, and the actor before and after it."""
+    """Records the ``train/`` entries of each update, and the actor before and after it."""
 
     def __init__(self):
         super().__init__()

@@ -1,1 +1,1 @@
-"""What all benchmarks share: a table of results, a pool of processes, intervals, and their look."""
+"""Shared by all benchmarks: a table of results, a pool of processes, intervals, figure style."""

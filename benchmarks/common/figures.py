@@ -1,4 +1,4 @@
-"""The look of figures."""
+"""The style of figures."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 import matplotlib as mpl
 
-# Okabe and Ito's colours, which colour-blind readers tell apart
+# Okabe and Ito's colours, which colour-blind readers can distinguish
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 STYLE: dict[str, Any] = {
     "figure.dpi": 150,
@@ -22,6 +22,6 @@ STYLE: dict[str, Any] = {
 
 
 def use_style() -> None:
-    """Draw to files, in this look."""
+    """Draw to files, in this style."""
     mpl.use("Agg")
     mpl.rcParams.update(STYLE)

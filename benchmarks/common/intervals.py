@@ -35,7 +35,7 @@ def interval(
     Parameters
     ----------
     samples
-        Each is resampled by itself.
+        Each is resampled separately.
     statistic
         Of as many samples as there are.
     method

@@ -1,4 +1,4 @@
-"""Results of a benchmark of several parts, each of which replaces its own."""
+"""Results of a benchmark of several parts. A run of a part replaces its results."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Parts:
     path: Path
 
     def read(self) -> dict[str, list[Row]]:
-        """Return the rows of each part; without a file, none."""
+        """Return the rows of each part, or none without a file."""
         parts: dict[str, list[Row]] = {}
         for line in Table(self.path).read().to_dict("records"):
             parts.setdefault(line["part"], []).append(json.loads(line["row"]))

@@ -1,4 +1,4 @@
-"""Jobs in parallel processes, each result handled as it comes."""
+"""Jobs in parallel processes. Each result is handled when its job ends."""
 
 from __future__ import annotations
 

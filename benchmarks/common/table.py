@@ -59,7 +59,7 @@ class Table:
         self.path.write_text(self._text([*kept, *rows], None), encoding="utf-8")
 
     def read(self) -> pd.DataFrame:
-        """Return all rows that count; none without a file."""
+        """Return all valid rows, or none without a file."""
         if not self.path.exists():
             return pd.DataFrame(columns=list(self.columns))
         # a setting, or the random policy's hyperparameters, may be the empty text

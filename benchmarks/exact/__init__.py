@@ -1,4 +1,4 @@
-"""Small decision processes whose J(θ), ∇J(θ) and ∇²J(θ) are known exactly, to be simulated too."""
+"""Small decision processes with exactly known J(θ), ∇J(θ) and ∇²J(θ), and their simulation."""
 
 from benchmarks.exact.causal import expected_causal_hessian
 from benchmarks.exact.env import TabularEnv, TabularVectorEnv

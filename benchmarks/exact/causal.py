@@ -1,4 +1,4 @@
-"""What the causal Hessian estimator estimates: its expectation, by dynamic programming."""
+"""The expectation of the causal Hessian estimator, by dynamic programming."""
 
 from __future__ import annotations
 

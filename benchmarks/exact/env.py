@@ -17,7 +17,7 @@ Array = NDArray[Any]
 
 
 class _Dynamics:
-    """Draws states and looks up rewards and one-hot observations, any number at once."""
+    """Draws states and returns rewards and one-hot observations, vectorised."""
 
     def __init__(self, mdp: TabularMDP) -> None:
         self.observation_space = spaces.Box(0.0, 1.0, (mdp.n_observations,), np.float32)
@@ -45,13 +45,13 @@ class _Dynamics:
 
     @staticmethod
     def _draw(cumulative: Array, rng: np.random.Generator, n: int) -> Array:
-        # the last bound, 1 up to rounding, is never passed
+        # no sample exceeds the last bound, which is 1 up to rounding
         drawn: Array = (rng.random((n, 1)) >= cumulative[:, :-1]).sum(1)
         return drawn
 
 
 class TabularEnv(gym.Env[Array, int]):
-    """Simulates a :class:`TabularMDP`; it stops at random, or after step H."""
+    """Simulates a :class:`TabularMDP`. Episodes stop at random, or after step H."""
 
     def __init__(self, mdp: TabularMDP) -> None:
         self._dynamics, self._horizon = _Dynamics(mdp), mdp.horizon
@@ -78,7 +78,7 @@ class TabularEnv(gym.Env[Array, int]):
 
 
 class TabularVectorEnv(VectorEnv[Array, Array, Array]):
-    """The same for ``num_envs`` episodes in parallel, which begin and end together.
+    """Simulates ``num_envs`` episodes in parallel, which begin and end together.
 
     Raises
     ------
@@ -107,7 +107,7 @@ class TabularVectorEnv(VectorEnv[Array, Array, Array]):
         return self._dynamics.see(self._states), {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """Take one step in each; after the last one, begin anew."""
+        """Take one step in each episode, and begin new episodes after the last one."""
         self._time += 1
         rewards = self._dynamics.reward[self._states, actions]
         self._states = self._dynamics.after(self.np_random, self._states, actions)

@@ -1,4 +1,4 @@
-"""The constants in which the theory measures steps: sup ‖∇²J‖ and sup ‖∇³J‖."""
+"""The Lipschitz constants of the theory: sup ‖∇²J‖ and sup ‖∇³J‖."""
 
 from __future__ import annotations
 

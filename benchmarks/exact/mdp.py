@@ -11,7 +11,7 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class TabularMDP:
-    """S hidden states of which the agent sees one of O observations, A actions, H steps.
+    """S hidden states, O observations, A actions and H steps.
 
     The policy is SB3's with ``net_arch=[]`` on one-hot observations, π(·|o; θ) = softmax(We_o + b):
     θ lists the weight W [A, O] row by row, then the bias b [A]. All functions of θ are float64.
@@ -125,7 +125,7 @@ class TabularMDP:
 
 
 def coordination_mdp(gamma: float = 1.0, noise: float = 0.0) -> TabularMDP:
-    r"""Two steps, +1 if the second action repeats the first, else -1; the first one is not seen.
+    r"""Two steps. The reward is +1 if the second action repeats the unobserved first, else -1.
 
     With z_h the difference of the two logits at step h,
 

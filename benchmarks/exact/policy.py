@@ -13,6 +13,6 @@ def actor_vector(policy: ActorCriticPolicy) -> Tensor:
 
 
 def assign_actor(policy: ActorCriticPolicy, theta: Tensor) -> None:
-    """Set them."""
+    """Set the weight and the bias of ``action_net``."""
     dtype = next(policy.action_net.parameters()).dtype
     vector_to_parameters(theta.to(dtype), policy.action_net.parameters())

@@ -1,4 +1,4 @@
-"""Training with steps as long as held-out episodes say, against the entry's ``target_kl``.
+"""Training with step lengths from held-out episodes, against the entry's ``target_kl``.
 
     python -m benchmarks.experiments.auto_kl
 
@@ -56,7 +56,7 @@ class AutoKL(ConfirmedCRPN):
     fraction: float = 1.0
 
     def _setup_model(self) -> None:
-        # fading sums of 1, slope, length · (slope - next slope), length²
+        # exponentially weighted sums of 1, slope, length · (slope - next slope), length²
         self._sums = np.zeros(4)
         super()._setup_model()
 
@@ -68,7 +68,7 @@ class AutoKL(ConfirmedCRPN):
         return DEFAULT_KL * min(HIGHEST, max(LOWEST, ratio)) * scaled / self.target_kl
 
     def _parabola_kl(self) -> float:
-        """Add what the present rollout says to the sums and return ½ (slope/curvature)²."""
+        """Add the present rollout to the sums and return ½ (slope/curvature)²."""
         slope = self.records[-1]["slope"]
         if math.isfinite(slope):
             self._sums *= MEMORY

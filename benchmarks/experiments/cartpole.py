@@ -1,4 +1,4 @@
-"""Whether the paper's algorithms solve CartPole-v1 at the paper's setting, and what it takes.
+"""The paper's algorithms on CartPole-v1 at the paper's setting, and changes that help.
 
     python -m benchmarks.experiments.cartpole --jobs 2
 
@@ -37,7 +37,7 @@ SETTING: dict[str, Any] = PAPER | {
 }
 N_UPDATES, SOLVED = 100, 475.0
 CAUSAL = {"hessian_estimator": "causal", "hessian_lambda": 1.0}
-# What differs from SETTING; only 1000 episodes change the budget
+# Differences from SETTING. Only 1000 episodes change the budget
 CHANGES: dict[str, dict[str, Any]] = {
     "": {},
     "alpha 3000": {"alpha": 3e3},
@@ -82,7 +82,7 @@ def measure(algorithm: str, change: str, seed: int, n_updates: int = N_UPDATES) 
 
 
 class _Updates(BaseCallback):
-    """Records what each update learnt from and did, and ends training after the last."""
+    """Records data and result of each update, and ends training after the last."""
 
     def __init__(self, n_updates: int) -> None:
         super().__init__()
@@ -174,7 +174,7 @@ def _draw_curves(axis: Axes, rows: pd.DataFrame) -> None:
 
 
 def _draw_changes(axis: Axes, rows: pd.DataFrame) -> None:
-    """Draw how much each update changed the policy: the divergences in order of size."""
+    """Draw the sorted KL divergences of the updates."""
     for colour, change in zip(PALETTE, DRAWN, strict=False):
         sizes = np.sort(rows[rows.change == change].kl_divergence.to_numpy())
         share = 1.0 - np.arange(len(sizes)) / len(sizes)

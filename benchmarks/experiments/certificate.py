@@ -36,7 +36,7 @@ VERDICTS = {
 
 @dataclass(frozen=True)
 class Case:
-    """A policy, with thresholds relative to what is true of it.
+    """A policy, with thresholds relative to its exact derivatives.
 
     ``epsilon`` is ε; ``threshold`` is √(ρε).
     """

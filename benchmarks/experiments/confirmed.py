@@ -1,4 +1,4 @@
-"""Whether confirmed slope and curvature tell how long a step should be.
+"""The length of a step from confirmed slope and curvature.
 
     python -m benchmarks.experiments.confirmed
 
@@ -51,7 +51,7 @@ def measure(env: str, seed: int) -> list[Row]:
 
 
 class ConfirmedCRPN(CRPN):
-    """CRPN that records what held-out episodes say of each step.
+    """CRPN that records the slope and curvature of each step on held-out episodes.
 
     Attributes
     ----------
@@ -89,14 +89,14 @@ class ConfirmedCRPN(CRPN):
         return super()._estimate(batch, joined, earlier)
 
     def _record_next_slope(self, gradient: Tensor) -> None:
-        """Add to the last update what this rollout says of its step."""
+        """Add this rollout's estimate of the last step to its update."""
         if self._last_step is not None:
             length = self.records[-1]["length"]
             self.records[-1]["next_slope"] = -float(gradient @ self._last_step) / length
 
 
 def secant_curvature(rows: pd.DataFrame) -> float:
-    """Return the curvature that the next rollouts' slopes speak of, by least squares."""
+    """Return the secant's curvature from the next rollouts' slopes, by least squares."""
     drop = rows.slope - rows.next_slope
     return float((rows.length * drop).sum() / (rows.length**2)[drop.notna()].sum())
 
@@ -127,7 +127,7 @@ def table(rows: pd.DataFrame) -> str:
 
 
 def draw(rows: pd.DataFrame) -> Figure:
-    """Draw the recommended divergence along training beside the entry's; print the table."""
+    """Draw the recommended divergence along training and the entry's. Print the table."""
     print(table(rows))
     envs = rows.groupby("env", sort=False)
     size = (2.6 * len(envs), 2.8)
@@ -146,7 +146,7 @@ def draw(rows: pd.DataFrame) -> Figure:
 
 
 def recommendations(run: pd.DataFrame) -> dict[str, pd.Series]:
-    """Return ½ (slope/curvature)² of fading means along a run, by the witness of the curvature."""
+    """Return ½ (slope/curvature)² of weighted means along a run, by the source of the curvature."""
     drop = run.length * (run.slope - run.next_slope)
     squares = (run.length**2).where(drop.notna())
     curvatures = {

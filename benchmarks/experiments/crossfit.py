@@ -1,4 +1,4 @@
-"""Steps judged by the episodes of one rollout that did not make them.
+"""Cross-fitting: steps evaluated on held-out episodes of the same rollout.
 
 A rollout's episodes are dealt to K folds. For each fold a step is made from the gradient of all
 *other* episodes, earlier rollouts included, in the Krylov space of that gradient, and the fold's
@@ -31,7 +31,7 @@ DIM = 10
 
 @dataclass(frozen=True)
 class Fold:
-    """One fold and the step's side of the split.
+    """One fold and the other episodes, which make the step.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Fold:
 
 
 class CrossFit:
-    """The folds of one rollout, with the earlier rollouts on the step's side of every split.
+    """The folds of one rollout. Previous rollouts always belong to the step.
 
     Parameters
     ----------
@@ -90,11 +90,11 @@ class CrossFit:
 
     @property
     def fresh_gradient(self) -> Tensor:
-        """The fresh rollout's gradient, a mean over steps, [d]."""
+        """The new rollout's gradient, a mean over steps, [d]."""
         return self.gradients[: self.n_folds].sum(0) / self.sizes[: self.n_folds].sum()
 
     def __iter__(self) -> Iterator[Fold]:
-        """Go through the folds."""
+        """Iterate over the folds."""
         n_fresh = self.sizes[: self.n_folds].sum()
         for k in range(self.n_folds):
             gradient = self.gradients.sum(0) - self.gradients[k]
@@ -127,9 +127,9 @@ class Confirmation:
     Attributes
     ----------
     claimed_slope
-        -g·s by the episodes that made the step.
+        -g·s on the episodes of the step.
     slope, curvature
-        -g·s and sᵀHs by those that did not.
+        -g·s and sᵀHs on the held-out episodes.
     """
 
     claimed_slope: float

@@ -1,4 +1,4 @@
-"""How many episodes it takes to leave a strict saddle.
+"""The number of episodes to leave a strict saddle.
 
     python -m benchmarks.experiments.escape --jobs 2
 
@@ -38,7 +38,7 @@ STARTS = {
 DISTANCE, NOISE = 1e-3, 3.0
 # sup ‖∇²J‖ = 3/2, at the saddle; sup ‖∇³J‖ = 2.65, on a grid over both logit differences
 L, L_H = 1.5, 2.65
-# What sets the length of the steps: the value used, then others
+# The argument that determines the step length: the value used, then others
 KNOBS = {
     "CRPN, paper": ("alpha", (3 * L_H, 0.3 * L_H, L_H, 10 * L_H)),
     "ACRPN, paper": ("alpha", (3 * L_H, 0.3 * L_H, L_H, 10 * L_H)),
@@ -124,7 +124,7 @@ def _draw_starts(axis: Axes, rows: pd.DataFrame) -> None:
     ):
         for place, algorithm in enumerate(KNOBS):
             runs = _select(rows, algorithm, start=start)
-            # points that the batch size puts on top of each other are spread a little
+            # a small horizontal offset separates points of equal batch size
             height = place + shift + rng.uniform(-0.08, 0.08, len(runs))
             x = runs.episodes * np.exp(rng.uniform(-0.05, 0.05, len(runs)))
             colour = COLOURS[algorithm]

@@ -1,4 +1,4 @@
-"""How far inside their guarantees Algorithm 1 ends, with the printed and with the derived recipe.
+"""The distance of Algorithm 1's result to its guarantee, with printed and derived recipes.
 
     python -m benchmarks.experiments.guarantee
 
@@ -95,7 +95,7 @@ class Enumerated:
         psi = -self.rewards[:, ::-1].cumsum(1)[:, ::-1]
         g = np.einsum("th,thi->ti", psi, scores)
         outer = g[:, :, None] * scores.sum(1)[:, None, :]
-        # ∇²log π = -E_a[σ σᵀ] at each step, whatever the action
+        # ∇²log π = -E_a[σ σᵀ] at each step, for every action
         each = np.einsum("ab,hf->habf", np.eye(2), features)  # e_a ⊗ φ_h
         each = np.concatenate([each[..., :H].reshape(H, 2, -1), each[..., H]], 2)
         centred = each - np.einsum("ha,hai->hi", policy, each)[:, None]
@@ -166,7 +166,7 @@ def _batch_means(
 
 
 def draw(rows: pd.DataFrame) -> Figure:
-    """Draw how far inside its bounds each run ends, and print the table."""
+    """Draw the norms at θ_R relative to their bounds, and print the table."""
     print(table(rows))
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained", sharey=True)
     for axis, (title, name) in zip(

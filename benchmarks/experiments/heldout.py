@@ -1,4 +1,4 @@
-"""What a single step is worth, judged by episodes that did not make it.
+"""The decrease of a single step on held-out episodes.
 
     python -m benchmarks.experiments.heldout
 
@@ -45,7 +45,7 @@ from sb3_crpn.curvature import HESSIAN_ESTIMATORS, JamesStein
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from sb3_crpn.episodes import EpisodeBatch
 
-# Timesteps after which learning is under way and far from done
+# Timesteps of a checkpoint early in learning
 CHECKPOINTS = {
     "CartPole-v1": 8_000,
     "Acrobot-v1": 15_000,
@@ -65,7 +65,7 @@ def jobs(seeds: int) -> list[Row]:
 
 
 def measure(env: str, seed: int) -> list[Row]:
-    """Train to the checkpoint and judge steps there."""
+    """Train to the checkpoint and evaluate steps there."""
     model = make_model(env, seed)
     model.learn(CHECKPOINTS[env])
     length = float(np.mean([episode["l"] for episode in model.ep_info_buffer or ()]))
@@ -74,7 +74,7 @@ def measure(env: str, seed: int) -> list[Row]:
 
 
 def judge_steps(model: CRPN, per_batch: int, rng: np.random.Generator) -> list[Row]:
-    """Make steps from batches of ``per_batch`` fresh episodes, and judge them by other batches."""
+    """Make steps from batches of ``per_batch`` new episodes, and evaluate them on others."""
     batches = model.estimate_curvature(N_BATCHES * per_batch).gradient_batch.split(N_BATCHES)
     model.policy.set_training_mode(False)
     estimator = HESSIAN_ESTIMATORS.resolve(model.hessian_estimator, model)
@@ -141,7 +141,7 @@ class _Judges:
         self._space, self._own, self._test = space, own, test
 
     def judge(self, hessian: Tensor, kl: float) -> Row:
-        """Return what own batch and test say of the step that is made with ``hessian``."""
+        """Return the decrease by the step of ``hessian``, on its own batch and held out."""
         step = step_of_kl(self._own[0], hessian, self._space, kl)
         length = self._space.length(step)
         row: Row = {"length": length}
@@ -156,7 +156,7 @@ class _Judges:
 
 
 def table(rows: pd.DataFrame) -> str:
-    """Return two Markdown tables: what H = 0's step is, and the gains of the others beside it."""
+    """Return two Markdown tables: the step of H = 0, and the differences of the other steps."""
     shortest = rows[(rows.hessian == "none") & (rows.kl == KLS[0])]
     natural = [_confirmed(str(env), group) for env, group in shortest.groupby("env", sort=False)]
     gains = []
@@ -173,7 +173,7 @@ def table(rows: pd.DataFrame) -> str:
 
 
 def _confirmed(env: str, rows: pd.DataFrame) -> list[str]:
-    """Return what the test says of the natural-gradient steps, and ½ (slope/curvature)²."""
+    """Return the held-out slope and curvature of natural-gradient steps, ½ (slope/curvature)²."""
     slope, curvature = rows.test_slope.mean(), rows.test_curvature.mean()
     share = slope / rows.own_slope.mean()
     numbers = [share, rows.own_curvature.mean(), curvature]

@@ -1,4 +1,4 @@
-"""CRPN with H from other episodes than the update's, or as much of it as other episodes confirm."""
+"""CRPN with H from other episodes, or with the share of H that held-out episodes confirm."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from sb3_crpn.curvature import HESSIAN_ESTIMATORS, CurvatureEstimate, estimate_c
 from sb3_crpn.episodes import EpisodeBatch
 
 MAX_ORACLE_ENVS = 16
-# ω from which the held-out value chooses
+# Candidates of ω
 OMEGAS = (0.0, 0.25, 0.5, 0.75, 1.0)
 MEMORY = 0.9  # by which the values of the past fade in an update
 
 
 class FreshHessian(CRPN):
-    """H from the fresh rollout alone, g from the earlier ones too."""
+    """H from the new rollout only, g also from previous rollouts."""
 
     def _estimate(
         self, batch: EpisodeBatch, joined: EpisodeBatch, earlier: list[EpisodeBatch]
@@ -71,7 +71,7 @@ class OracleHessian(FreshHessian):
 
 
 class ConfirmedHessian(CRPN):
-    """ω, and whether earlier rollouts join H, by the step's value on episodes that did not make it.
+    """ω, and the use of previous rollouts in H, chosen by the step's value on held-out episodes.
 
     The value of a choice is the mean over folds of -(g·s + ½ sᵀHs), g and H the fold's, s made from
     all other episodes with that choice and ``target_kl``; and over updates, the past fading.
@@ -106,7 +106,7 @@ class ConfirmedHessian(CRPN):
         )
 
     def _judge(self, folds: CrossFit) -> None:
-        """Let this rollout's values fade into the means."""
+        """Update the exponentially weighted means with this rollout's values."""
         total: dict[tuple[str, float], float] = {}
         for fold in folds:
             for choice, value in self._fold_values(folds, fold).items():

@@ -16,7 +16,7 @@ from benchmarks.reinforce import REINFORCE
 from sb3_crpn import ACRPN, CRPN, PAPER
 from sb3_crpn.vec_env import GymnasiumVecEnv
 
-# PAPER without what concerns the Hessian, for REINFORCE
+# PAPER without the arguments of the Hessian, for REINFORCE
 PAPER_GRADIENT = {
     key: value
     for key, value in PAPER.items()
@@ -58,7 +58,7 @@ def make_learner(
 
 
 class UntilExactly(BaseCallback):
-    """Stops once θ, looked at before the first update and after each, meets a condition.
+    """Stops once θ meets a condition. θ is checked before the first update and after each.
 
     Parameters
     ----------
@@ -96,6 +96,6 @@ def run_until(
 ) -> UntilExactly:
     """Train until ``condition`` holds for θ, or for ``max_updates`` updates."""
     until = UntilExactly(condition, max_updates)
-    # the step that a stopped rollout has begun is the only one beyond the updates
+    # only the first step of the stopped rollout is beyond the updates
     model.learn(10**12, callback=until)
     return until

@@ -1,4 +1,4 @@
-"""The paper's algorithm on its continuous tasks, in its own settings, and why it does not learn.
+"""The paper's algorithm on its continuous tasks at its settings, and why it does not learn.
 
     python -m benchmarks.experiments.mujoco
 
@@ -114,7 +114,7 @@ def leftmost(estimate: CurvatureEstimate) -> tuple[float, torch.Tensor]:
 
 
 class _Updates(BaseCallback):
-    """Records what each update learnt from and did, and ends training after the last."""
+    """Records data and result of each update, and ends training after the last."""
 
     def __init__(self, timesteps: int) -> None:
         super().__init__()
@@ -148,7 +148,7 @@ class _Updates(BaseCallback):
 
 
 def draw(rows: pd.DataFrame) -> Figure:
-    """Draw the learning curves and how far updates go, and print the table."""
+    """Draw the learning curves and the updates' divergences, and print the table."""
     print(table(rows))
     envs = [env for env in TIMESTEPS if env in set(rows.env)]
     size = (9, 3.2 * len(envs))

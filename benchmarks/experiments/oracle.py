@@ -1,4 +1,4 @@
-"""What the Hessian is worth in training, and what a better estimate of it would be worth.
+"""The value of the Hessian in training, and of a better estimate of it.
 
     python -m benchmarks.experiments.oracle
 

@@ -1,4 +1,4 @@
-"""How many episodes it takes to reach an ε-second-order stationary point, as a function of ε.
+"""The number of episodes to an ε-second-order stationary point, as a function of ε.
 
     python -m benchmarks.experiments.sample_complexity
 
@@ -40,7 +40,7 @@ from sb3_crpn.cubic import solve_dense
 BATCH_CONSTANT = 8
 MAX_UPDATES = 1000
 EXACT_EPSILONS = (0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
-# The exponent that each algorithm's theory bounds the episodes by
+# The exponent of each algorithm's theoretical bound on the episodes
 BOUNDS = {"CRPN, paper": -3.5, "REINFORCE": -4.0}
 COLOURS = dict(zip(BOUNDS, PALETTE, strict=False))
 
@@ -71,7 +71,7 @@ PROBLEMS = {
         L_H=2.65,
         epsilons=(0.4, 0.2, 0.1, 0.05, 0.02),
     ),
-    # Four states that all look alike: the best policy is random, p = (0.683, 0.317)
+    # Four states with one observation: the optimal policy is stochastic, p = (0.683, 0.317)
     "interior": Problem(
         "blind agent, from p = (0.05, 0.95): optimum inside",
         random_mdp(26, n_states=4, n_observations=1, horizon=4, gamma=1.0),
@@ -114,7 +114,7 @@ def measure(problem: str, algorithm: str, epsilon: float, seed: int) -> list[Row
 
 
 def exact_updates(problem: Problem, algorithm: str) -> list[int]:
-    """Return how many noiseless updates reach an ε-SOSP, for each of ``EXACT_EPSILONS``."""
+    """Return the number of noiseless updates to an ε-SOSP, for each of ``EXACT_EPSILONS``."""
     mdp, theta = problem.mdp, problem.start
     if not mdp.gradient(theta).any():  # gradient steps alone would stay on the saddle
         theta = theta + 1e-3 * torch.linalg.eigh(mdp.hessian(theta)).eigenvectors[:, 0]

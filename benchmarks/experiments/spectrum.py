@@ -1,4 +1,4 @@
-"""What the spectrum of ∇²J looks like along training.
+"""The spectrum of ∇²J along training.
 
     python -m benchmarks.experiments.spectrum
 
@@ -50,7 +50,7 @@ CHECKPOINTS = {
     "CartPole-v1": (0, 5_000, 10_000, 20_000, 30_000, 50_000),
     "Pendulum-v1": (0, 10_000, 25_000, 50_000, 75_000, 100_000),
 }
-# Learning from fresh rollouts alone, so that the policies do not depend on the defaults of reuse
+# No replay, so that the policies do not depend on the defaults of replay
 SETTINGS: dict[str, int] = {
     "n_steps": 2048,
     "n_reused_rollouts": 0,
@@ -61,7 +61,7 @@ N_EPISODES = {"CartPole-v1": 50, "Pendulum-v1": 100}
 N_ENVS = 8
 HESSIANS = {"own": ("-", "CRPN's"), "unbiased": (":", "unbiased")}
 ENDS = {"max": (PALETTE[1], "largest"), "min": (PALETTE[0], "smallest")}
-# Relative accuracy of the halves' eigenvalues: far below their noise
+# Relative accuracy of the folds' eigenvalues: far below their noise
 TOLERANCE = 0.01
 
 
@@ -123,7 +123,7 @@ class _Checkpoints(BaseCallback):
 
 
 def _halves(model: CRPN, batch: EpisodeBatch, kappa: float) -> list[Operator]:
-    """Return the products with the Hessians of either half of the episodes."""
+    """Return the products with the Hessians of both folds of the episodes."""
     weights = Causal(kappa)
     return [
         EpisodeDerivatives(model.policy, model.actor, part, weights).hessian_product
@@ -163,7 +163,7 @@ def _listed(values: NDArray[np.float64]) -> str:
 
 
 def draw(rows: pd.DataFrame) -> Figure:
-    """Draw eigenvalues, what is confirmed of them, and densities; print the medians."""
+    """Draw eigenvalues, their confirmed shares and densities. Print the medians."""
     for end in ENDS:
         rows[f"confirmed_{end}"] = rows[f"checked_{end}"] / rows[f"lambda_{end}"]
     columns = ["discounted_return", "lambda_min", "confirmed_min", "lambda_max", "confirmed_max"]

@@ -73,7 +73,7 @@ def fisher_subspace(
 
 
 def parabola_kl(slope: float, curvature: float) -> float:
-    """Return ½ (slope/curvature)²; 0 where the cost does not fall, ∞ where it only falls."""
+    """Return ½ (slope/curvature)²; 0 if the cost increases, ∞ if it decreases without bound."""
     if slope <= 0.0:
         return 0.0
     return 0.5 * (slope / curvature) ** 2 if curvature > 0.0 else math.inf
@@ -82,7 +82,7 @@ def parabola_kl(slope: float, curvature: float) -> float:
 def step_of_kl(gradient: Tensor, hessian: Tensor, space: Subspace, kl: float) -> Tensor:
     """Return the minimiser y of g·y + ½ yᵀHy + (α/6)‖y‖³ whose KL divergence is ``kl``.
 
-    It is -(H + λI)⁻¹g with H + λI ⪰ 0. Where the Newton step, λ = 0, is shorter, that one.
+    It is -(H + λI)⁻¹g with H + λI ⪰ 0. If the Newton step, λ = 0, is shorter, it is returned.
     """
     eigenvalues, vectors = torch.linalg.eigh(hessian)
     slopes = vectors.T @ gradient
@@ -91,7 +91,7 @@ def step_of_kl(gradient: Tensor, hessian: Tensor, space: Subspace, kl: float) ->
     def step(multiplier: float) -> Tensor:
         return -(vectors @ (slopes / (eigenvalues + multiplier)))
 
-    # no multiplier is smaller: there the step is endless, or Newton's
+    # the smallest multiplier: the step is unbounded there, or Newton's
     scale = float(gradient.norm()) / target
     least = max(0.0, -float(eigenvalues[0])) + TOLERANCE * scale
     if space.length(step(least)) <= target:

@@ -1,4 +1,4 @@
-"""What the experiments share: a CSV that grows job by job, a figure, and their command."""
+"""Shared by the experiments: a CSV that grows by jobs, a figure, and their command."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Study:
         return Table(ROOT / "benchmarks" / "experiments" / f"{self.name}.csv")
 
     def main(self, description: str) -> None:
-        """Measure what the CSV lacks and draw the figure."""
+        """Measure the missing jobs and draw the figure."""
         parser = argparse.ArgumentParser(description=description)
         parser.add_argument("--seeds", type=int, default=self.seeds)
         parser.add_argument("--jobs", type=int, default=1, help="processes")

@@ -1,4 +1,4 @@
-"""Models with the settings of an environment's entry in ``zoo_configs``, and what training gave."""
+"""Models with the settings of an entry in ``zoo_configs``, and the returns of their training."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sb3_crpn import CRPN
 
 
 def make_model(env: str, seed: int, algorithm: type[CRPN] = CRPN, **arguments: Any) -> CRPN:
-    """Return a model of ``env`` with its entry's settings, ``arguments`` in their place."""
+    """Return a model of ``env`` with its entry's settings, overridden by ``arguments``."""
     _, settings = resolve("CRPN", env, arguments)
     settings.pop("n_timesteps", None)
     keywords = settings.get("policy_kwargs")
@@ -28,7 +28,7 @@ def make_model(env: str, seed: int, algorithm: type[CRPN] = CRPN, **arguments: A
 
 
 class Returns(BaseCallback):
-    """Keeps (end step, length, return) of all episodes, and ends training with the budget."""
+    """Records (end step, length, return) of all episodes, and ends training at the budget."""
 
     def __init__(self, timesteps: int) -> None:
         super().__init__()

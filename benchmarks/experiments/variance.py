@@ -1,4 +1,4 @@
-"""How far the estimates of ∇²J are from it: trajectory against causal, baselines, and κ.
+"""Errors of the estimates of ∇²J: trajectory against causal, baselines, and κ.
 
     python -m benchmarks.experiments.variance
 
@@ -153,7 +153,7 @@ def draw(rows: pd.DataFrame) -> Figure:
 
 
 def _geometric(values: NDArray[np.float64]) -> float:
-    """Return the geometric mean, of which the mean of ratios is the ratio of means."""
+    """Return the geometric mean. The mean of ratios is then the ratio of means."""
     return float(np.exp(np.log(values).mean()))
 
 

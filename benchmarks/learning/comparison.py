@@ -1,4 +1,4 @@
-"""What the CSV files say: runs that belong together, normalised scores, steps to a level."""
+"""A comparison from the CSV files: groups of runs, normalised scores, steps to a level."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from benchmarks.learning.statistics import Array
 
 METRICS = {"mean_return": "mean return over training", "final_return": "final return"}
 
-# Levels are compared on curves averaged over so many bins, a tenth of the budget
+# Bins of the moving average for levels, a tenth of the budget
 WINDOW = 5
 
 Scores = dict[str, list[Array]]  # by algorithm, an array of seeds for each environment
@@ -53,7 +53,7 @@ class Comparison:
 
     @property
     def learners(self) -> list[str]:
-        """Algorithms but for the random policy."""
+        """Algorithms without the random policy."""
         return [label for label in self.labels if label != RANDOM]
 
     @property
@@ -154,7 +154,7 @@ def compare(runs: pd.DataFrame, curves: pd.DataFrame, baseline: str) -> Comparis
 
 
 def _are_current(runs: pd.DataFrame) -> pd.Series:
-    """Return which rows agree in their hyperparameters with the last one of their group."""
+    """Return the mask of rows with the hyperparameters of the last one of their group."""
     groups = runs.groupby(["algo", "env", "setting", "timesteps"])["hyperparameters"]
     latest = groups.transform("last")
     agree = [same_hyperparameters(a, b) for a, b in zip(runs.hyperparameters, latest, strict=True)]

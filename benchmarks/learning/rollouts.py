@@ -1,4 +1,4 @@
-"""CRPN's rollouts of whole episodes and of timesteps, all else being equal.
+"""CRPN with rollouts of whole episodes and of timesteps, at equal settings.
 
     python -m benchmarks.learning.rollouts --jobs 1   # run what is missing
     python -m benchmarks.learning.rollouts --table

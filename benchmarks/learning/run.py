@@ -36,7 +36,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Run:
-    """What to train; the fields that tell runs apart are the leading columns of the results."""
+    """A training run. Its identifying fields are the leading columns of the results."""
 
     algo: str
     env: str
@@ -192,7 +192,7 @@ def _episode_recorder(timesteps: int) -> Any:
             self.n_rollouts = 0
 
         def _on_step(self) -> bool:
-            # beyond the budget nobody learns: rollouts that overrun it are not trained on
+            # no algorithm trains on a rollout that exceeds the budget
             if self.num_timesteps > timesteps:
                 return False
             for info in self.locals["infos"]:
@@ -245,7 +245,7 @@ def learning_curve(
 
 
 class _RandomPolicy:
-    """Actions drawn uniformly, as ``evaluate_policy`` asks for them."""
+    """Uniformly random actions, for ``evaluate_policy``."""
 
     def __init__(self, env: Any, seed: int) -> None:
         self.space, self.n_envs = env.action_space, env.num_envs
@@ -280,7 +280,7 @@ def _evaluate_random(run: Run) -> Result:
 
 
 def versions() -> str:
-    """Return the versions of what decides a result."""
+    """Return the versions of the libraries that determine a result."""
     packages = (
         "sb3-crpn", "stable-baselines3", "sb3-contrib", "rl-zoo3", "gymnasium", "mujoco", "torch",
         "numpy",

@@ -1,4 +1,4 @@
-"""Which hyperparameters an algorithm runs with on an environment, and for how many steps.
+"""The hyperparameters and the budget of an algorithm on an environment.
 
 Peers run with those that rl-zoo publishes for the environment; where it has none, with the nearest
 entry: another version of the same task, else the one named in ``NEAREST``. CRPN and ACRPN run with
@@ -60,12 +60,12 @@ NEAREST: dict[str, dict[str, str]] = {
 
 # Settings of a run that are no constructor arguments, with rl-zoo's defaults
 _OF_ENVIRONMENT = {"n_envs": 1, "normalize": False}
-# Arguments that cannot change what is learnt, or that every run sets itself
+# Arguments that do not affect learning, or that every run sets
 _NOT_RECORDED = {
     "env", "n_timesteps", "seed", "device", "verbose", "tensorboard_log", "stats_window_size",
     "rollout_buffer_class", "rollout_buffer_kwargs", "_init_setup_model",
 }  # fmt: skip
-# CRPN's arguments that a gradient step has no use for
+# CRPN's arguments that a gradient step does not use
 _NOT_REINFORCE = {
     "alpha", "target_kl", "metric", "fisher_damping", "hessian_estimator", "hessian_lambda",
     "hessian_shrinkage", "krylov_dim", "n_hessian_episodes",

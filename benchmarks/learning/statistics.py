@@ -22,7 +22,7 @@ def stratified_bootstrap(
 ) -> Estimate:
     """Return a statistic with percentile bounds; seeds are resampled within each environment.
 
-    What the scores were normalised by is taken as known, as in rliable. Environments of one seed
+    The normalisation of the scores is taken as exact, as in rliable. Environments of one seed
     alone have no interval (NaN).
     """
     value = statistic(samples)

@@ -54,7 +54,7 @@ def is_done(run: Run, done: pd.DataFrame) -> bool:
 
 
 def matches(run: Run, rows: pd.DataFrame) -> pd.Series:
-    """Return which rows of runs have this one's hyperparameters, whatever their setting's name."""
+    """Return the mask of rows with this run's hyperparameters, for every name of a setting."""
     keys = [name for name in KEYS if name != "setting"]
     found = (rows[keys] == [getattr(run, name) for name in keys]).all(axis=1)
     for index in found.index[found]:

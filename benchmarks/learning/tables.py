@@ -125,7 +125,7 @@ def cost_table(comparison: Comparison) -> str:
 
 
 def entry_table(comparison: Comparison) -> str:
-    """Return where the hyperparameters come from."""
+    """Return the origin of the hyperparameters."""
     labels, runs = comparison.learners, comparison.runs
     rows: list[list[str]] = []
     for task in comparison.tasks:

@@ -1,4 +1,4 @@
-"""What second order costs, in ratios to what a gradient, TRPO or SB3 costs in the same run."""
+"""The cost of second order, as ratios to a gradient, TRPO or SB3 in the same run."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""Measure what second order costs, as ratios within one run; print tables.
+"""Measure the cost of second order as ratios within one run. Print tables.
 
     python -m benchmarks.speed                      # all parts
     python -m benchmarks.speed products updates     # these alone; the others' results stay
@@ -53,7 +53,7 @@ RESULTS = Path(__file__).with_name("speed.csv")
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the parts asked for, or print what there is."""
+    """Run the given parts, or print the stored results."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.speed",
         description=__doc__,
@@ -75,7 +75,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def run_part(part: str, file: Path, **sizes: Any) -> None:
-    """Measure a part, put its results into the file in place of earlier ones, and print them."""
+    """Measure a part, replace its results in the file, and print them."""
     start = time.perf_counter()
     with one_thread():
         rows = PARTS[part](**sizes)
@@ -86,7 +86,7 @@ def run_part(part: str, file: Path, **sizes: Any) -> None:
 
 
 def machine() -> dict[str, str]:
-    """Return what the times depend on, besides the code."""
+    """Return the machine and versions that the times depend on."""
     found = {"processor": _processor()}
     if torch.cuda.is_available():
         found["gpu"] = torch.cuda.get_device_name()

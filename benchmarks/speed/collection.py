@@ -1,4 +1,4 @@
-"""Rollouts of whole episodes, in SB3's own rollouts at equally many steps."""
+"""Rollouts of whole episodes, relative to SB3's rollouts of as many steps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Products, updates and certificates on a GPU, in the CPU's time."""
+"""Products, updates and certificates on a GPU, relative to the CPU."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SIZES = ((64, 2_000), (64, 16_000), (256, 2_000), (1024, 2_000))
 def measure(
     repeats: int = 4, sizes: Sequence[tuple[int, int]] = SIZES, episode: int = 500
 ) -> list[Row]:
-    """Compare the GPU with one core and with all of them, or say why that was not possible.
+    """Compare the GPU with one core and with all cores, or state why that is impossible.
 
     The wall clock is the one to read: a GPU works while the process waits.
     """
@@ -81,7 +81,7 @@ def _certificate(model: CRPN) -> Task:
 
 
 def threaded(task: Task, n_threads: int) -> Task:
-    """Return the task with torch computing in so many threads, one again after it."""
+    """Return the task with the given number of torch threads, and one thread after it."""
 
     def run() -> float | None:
         torch.set_num_threads(n_threads)
@@ -94,7 +94,7 @@ def threaded(task: Task, n_threads: int) -> Task:
 
 
 def synchronised(task: Task) -> Task:
-    """Return the task with the GPU's queue empty at both ends."""
+    """Return the task with a synchronised GPU before and after it."""
 
     def run() -> float | None:
         torch.cuda.synchronize()

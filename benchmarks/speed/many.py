@@ -1,4 +1,4 @@
-"""Many environments: rollouts and updates per timestep, in TRPO's."""
+"""Many environments: rollouts and updates per timestep, relative to TRPO."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ CASES: tuple[tuple[str, int, str, Callable[[int], VecEnv]], ...] = (
     ("HalfCheetah-v5", 16, "DummyVecEnv", lambda n: make_vec_env("HalfCheetah-v5", n, seed=0)),
     ("HalfCheetah-v5", 16, "SubprocVecEnv", _processes),
 )
-# By default CRPN reuses three rollouts; the others learn from the fresh one alone
+# By default CRPN reuses three rollouts. The others learn from the new rollout only
 LEARNERS: dict[str, tuple[type[OnPolicyAlgorithm], dict[str, Any]]] = {
     "TRPO": (TRPO, {}),
     "PPO": (PPO, {}),
@@ -85,7 +85,7 @@ def _rollout(model: OnPolicyAlgorithm) -> Task:
 
 
 def _update(model: OnPolicyAlgorithm, *, critic: bool = True) -> Task:
-    """Return the update from the rollout that is there; its work is the rollout's timesteps."""
+    """Return the update from the present rollout. Its work is the rollout's timesteps."""
     task = update_task(model, critic=critic)
 
     def run() -> float:

@@ -1,4 +1,4 @@
-"""Frozen problems: networks and random episodes of the shapes of well-known tasks."""
+"""Fixed problems: networks and random episodes with the shapes of well-known tasks."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SHAPES: dict[str, tuple[int, spaces.Space[Any]]] = {
 
 
 class Noise(VectorEnv[Any, Any, Any]):
-    """Random observations and rewards of a task's shapes; episodes do not end by themselves."""
+    """Random observations and rewards with a task's shapes, in endless episodes."""
 
     metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.DISABLED}
 

@@ -1,4 +1,4 @@
-"""One Hessian and one Fisher product, in gradients."""
+"""One Hessian and one Fisher product, relative to a gradient."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from benchmarks.speed.timing import CLOCKS, interleaved, median, slope
 from sb3_crpn import CRPN
 
 SHAPE = "HalfCheetah-v5"
-# Beyond so many steps, batches are cut; their graphs would not fit in memory
+# Larger batches are split, since their graphs would not fit into memory
 MAX_BATCH_TIMESTEPS = 50_000
 
 TIMESTEPS = (1_000, 10_000, 100_000, 1_000_000)
@@ -32,7 +32,7 @@ def measure(
 
 
 def split(timesteps: int) -> dict[str, Any]:
-    """Return how batches of so many steps are cut."""
+    """Return the split of batches of ``n_steps`` steps."""
     too_long = timesteps > 2 * MAX_BATCH_TIMESTEPS
     return {"max_batch_timesteps": MAX_BATCH_TIMESTEPS} if too_long else {}
 

@@ -17,7 +17,7 @@ KRYLOV = (100, 1_000, 10_000, 100_000, 1_000_000)
 def measure(
     repeats: int = 20, dense: tuple[int, ...] = DENSE, krylov: tuple[int, ...] = KRYLOV
 ) -> list[Row]:
-    """Compare the two where both can be had, and follow the Krylov solver to large d."""
+    """Compare both solvers up to moderate d, and the Krylov solver up to large d."""
     rows = []
     for d in dense:
         g, product = random_model(d)

@@ -1,4 +1,4 @@
-"""Simulation in a ``gymnasium.vector`` environment, in SB3's ``DummyVecEnv`` of as many."""
+"""Simulation in a ``gymnasium.vector`` environment, relative to SB3's ``DummyVecEnv``."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def measure(repeats: int = 20, n_steps: int = 200) -> list[Row]:
 
 
 def _steps(env: VecEnv, n_steps: int) -> Task:
-    """Return so many steps of every environment."""
+    """Return the task of stepping every environment."""
     env.seed(0)
     env.reset()
     env.action_space.seed(0)

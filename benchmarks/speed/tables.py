@@ -9,7 +9,7 @@ from benchmarks.common.markdown import estimate, markdown, number
 from benchmarks.common.table import Row
 from benchmarks.speed.timing import CLOCKS
 
-# Keys of a comparison's row that are not its case
+# Keys of a comparison's row besides its case
 _RESULTS = ("unit", "repeats", "ms", "ratio")
 
 TITLES = {
@@ -27,7 +27,7 @@ TITLES = {
 
 
 def report(results: dict[str, list[Row]]) -> str:
-    """Return the tables of all parts that there are."""
+    """Return the tables of all stored parts."""
     return "\n\n".join(part_report(part, results[part]) for part in TITLES if part in results)
 
 

@@ -1,4 +1,4 @@
-"""Times of tasks that take turns, and the ratios of those times.
+"""Times of interleaved tasks, and their ratios.
 
 pytest-benchmark and pyperf time one function after the other, so that a shared machine's drift
 enters their ratios; here the calls are interleaved in random order and ratios formed turn by turn.

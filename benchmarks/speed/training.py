@@ -1,4 +1,4 @@
-"""Whole training runs, in TRPO's at equally many steps."""
+"""Whole training runs, relative to TRPO at as many steps."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sb3_crpn import ACRPN, CRPN
 ENVS = ("CartPole-v1", "Pendulum-v1")
 
 
-def measure(repeats: int = 6, timesteps: int = 20_480) -> list[Row]:
+def measure(repeats: int = 6, timesteps: int = 20_480, warm_ups: int = 1) -> list[Row]:
     """Compare the time per timestep of ``learn``, each turn with another seed.
 
     TRPO runs with its own defaults ("TRPO") and with CRPN's rollout length and critic work
@@ -34,7 +34,7 @@ def measure(repeats: int = 6, timesteps: int = 20_480) -> list[Row]:
             "ACRPN": _learn(ACRPN, env, timesteps, {}),
         }
         case = {"env": env, "timesteps": timesteps}
-        rows.append(compare(case, tasks, "TRPO, same critic", repeats, warm_ups=1))
+        rows.append(compare(case, tasks, "TRPO, same critic", repeats, warm_ups))
     return rows
 
 

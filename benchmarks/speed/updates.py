@@ -1,4 +1,4 @@
-"""One CRPN and one ACRPN update, in TRPO's: same data, same network, same critic work."""
+"""One CRPN and one ACRPN update, relative to TRPO: same data, network and critic work."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from benchmarks.common.table import Row
 from benchmarks.speed.problems import noise
-from benchmarks.speed.timing import Task, compare
+from benchmarks.speed.timing import WARM_UPS, Task, compare
 from sb3_crpn import ACRPN, CRPN
 from sb3_crpn.algorithm import PolicyNewtonAlgorithm
 from sb3_crpn.episodes import Replay
@@ -27,11 +27,13 @@ WARM_UP_ROLLOUTS = 3
 
 SETTINGS: dict[str, dict[str, Any]] = {"one rollout": {"n_reused_rollouts": 0}, "defaults": {}}
 
-# What training changes besides networks and optimiser
+# State that training changes besides networks and optimiser
 _MUTABLE = (bool, int, float, type(None), Replay)
 
 
-def measure(repeats: int = 20, n_steps: int = 2048, n_envs: int = 2) -> list[Row]:
+def measure(
+    repeats: int = 20, n_steps: int = 2048, n_envs: int = 2, warm_ups: int = WARM_UPS
+) -> list[Row]:
     """Compare whole updates, and updates without the critic's fit.
 
     CartPole-v1 is the task itself in one environment, HalfCheetah-v5 noise of its shapes. "one
@@ -55,7 +57,7 @@ def measure(repeats: int = 20, n_steps: int = 2048, n_envs: int = 2) -> list[Row
                     algorithm: update_task(model, critic=part == "update")
                     for algorithm, model in models.items()
                 }
-                rows.append(compare(case, tasks, "TRPO", repeats))
+                rows.append(compare(case, tasks, "TRPO", repeats, warm_ups))
     return rows
 
 
@@ -121,7 +123,7 @@ def _as_sb3(leader: PolicyNewtonAlgorithm, model: OnPolicyAlgorithm) -> RolloutB
 
 
 def update_task(model: OnPolicyAlgorithm, *, critic: bool) -> Task:
-    """Return ``model.train()`` from the state in which the model is now."""
+    """Return ``model.train()`` from the present state of the model."""
     policy = copy.deepcopy(model.policy.state_dict())
     optimizer = copy.deepcopy(model.policy.optimizer.state_dict())
     state = {name: value for name, value in vars(model).items() if isinstance(value, _MUTABLE)}

@@ -138,10 +138,8 @@ def cubic_finalsolver(
     return _cubic_step(problem, _gradient_descent(stable, problem.epsilon / 2))
 
 
-def estimate_lipschitz(
-    hvp: Operator, like: Tensor, *, products: int = _LIPSCHITZ_PRODUCTS, seed: int = 0
-) -> float:
-    """Estimate ℓ = ‖H‖₂ by a few Lanczos products from a random start.
+def estimate_lipschitz(hvp: Operator, like: Tensor, *, seed: int = 0) -> float:
+    """Estimate ℓ = ‖H‖₂ by at most ten Lanczos products from a random start.
 
     Returns max|θ| + ‖r‖, θ the Ritz values and r the residual vector of the last Lanczos step. It
     is the safeguarded bound of Zhou & Li 2011 (Linear Algebra Appl. 435), which is rarely below
@@ -153,19 +151,14 @@ def estimate_lipschitz(
         v ↦ Hv, Tensor[d] to Tensor[d].
     like
         A tensor with the size, dtype and device of v.
-    products
-        Maximum number of products, ≥ 1. Lanczos stops earlier on an invariant Krylov space.
     seed
         Seed of the random start. PyTorch's global generator is not used.
     """
-    products = COUNT("estimate_lipschitz: products", products)
-    seed = SEED("estimate_lipschitz: seed", seed)
-    operator = CountedOperator("estimate_lipschitz: hvp", hvp)
     q, previous = random_unit_vector(like, seed), torch.zeros_like(like)
     diagonal: list[float] = []
     off_diagonal: list[float] = [0.0]
-    for _ in range(min(products, like.numel())):
-        product = operator(q) - off_diagonal[-1] * previous
+    for _ in range(min(_LIPSCHITZ_PRODUCTS, like.numel())):
+        product = hvp(q) - off_diagonal[-1] * previous
         diagonal.append(float(q @ product))
         product = product - diagonal[-1] * q
         beta = float(torch.linalg.vector_norm(product))

@@ -15,7 +15,7 @@ class Trial:
 
 
 class Law:
-    """α ↦ trial of a KL that is a function of α; refuses to try one twice."""
+    """α ↦ trial with a given KL(α). A second trial of the same α is an error."""
 
     def __init__(self, function):
         self.function = function

@@ -119,7 +119,7 @@ def test_unknown_arguments(algorithm):
 @both
 @pytest.mark.parametrize("other", [PPO, A2C, TRPO])
 def test_arguments_of_other_algorithms_are_there_or_named(algorithm, other):
-    """Where they are there, a positional one has the same place."""
+    """A positional argument that SB3 has too has the same position."""
     theirs, ours = (inspect.signature(cls).parameters for cls in (other, algorithm))
     assert theirs.keys() - ours.keys() <= algorithm.replacements.keys()
     for name in theirs.keys() - ours.keys():
@@ -261,7 +261,7 @@ def test_estimate_curvature_checks_its_argument(algorithm, n_episodes):
     ],
 )
 def test_schedules_with_bad_values(algorithm, name, value):
-    """A schedule can only be judged when it is called; the policy is then as before."""
+    """A schedule is checked when it is called. The policy is then unchanged."""
     model = make(algorithm, target_kl=None, **{name: lambda left: 1.0 if left > 0.9 else value})
     before = None
 
@@ -274,7 +274,7 @@ def test_schedules_with_bad_values(algorithm, name, value):
     message = rf"^{algorithm.__name__}: {name}\(0\.\d+\)={value!r} is not allowed, must be a finite"
     with pytest.raises(ValueError, match=message):
         model.learn(500, Keep())
-    # numbers of episodes are judged before the next rollout, the others before the update
+    # numbers of episodes are checked before the next rollout, the others before the update
     assert model._n_updates > 0 if name == "n_episodes" else same(model, before)
 
 
@@ -286,7 +286,7 @@ def test_a_learning_rate_that_begins_badly(algorithm):
 
 @both
 def test_krylov_dim_beyond_the_number_of_parameters(algorithm):
-    """There are no more than d vectors in a basis of ℝᵈ."""
+    """A basis of ℝᵈ has at most d vectors."""
     large, exact = (
         make(algorithm, net_arch=[], krylov_dim=dim).learn(60)
         for dim in (10**12, len(make(algorithm, net_arch=[]).actor))

@@ -13,7 +13,7 @@ TARGET = 0.01
 
 
 class Recorded:
-    """A solver that keeps every α that it is asked for."""
+    """A solver that records every α."""
 
     def __init__(self):
         self.alphas = []
@@ -49,7 +49,7 @@ def test_no_step_is_tried_twice_and_the_actor_is_at_the_best(attempt, alpha):
 
 
 def test_an_earlier_trial_may_be_the_best(attempt, monkeypatch):
-    """A smaller α does not lengthen this step: the trial before it is taken."""
+    """A smaller α does not lengthen this step. The previous trial is accepted."""
     actor, evaluator, model = attempt
     origin, evaluate = actor.vector, evaluator.evaluate
     short = []

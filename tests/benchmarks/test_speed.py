@@ -18,11 +18,11 @@ from sb3_crpn import CRPN
 
 TINY = {
     "products": {"repeats": 2, "n_steps": 40},
-    "updates": {"repeats": 1, "n_steps": 64},
+    "updates": {"repeats": 1, "n_steps": 64, "warm_ups": 0},
     "collection": {"repeats": 1, "n_steps": 64},
     "stepping": {"repeats": 1, "n_steps": 5},
     "many": {"repeats": 1, "n_steps": 128, "n_cases": 1},
-    "training": {"repeats": 1, "timesteps": 1},
+    "training": {"repeats": 1, "timesteps": 1, "warm_ups": 0},
     "solves": {"repeats": 1, "dense": (5, 8), "krylov": (10, 20)},
     "scaling": {"repeats": 2, "timesteps": (20, 40), "parameters": (100, 200), "n_steps": 20},
     "memory": {"timesteps": (50, 100), "parameters": (100,), "updates": (60,)},

@@ -32,7 +32,7 @@ class Problem:
 
 
 class Counter:
-    """v ↦ Hv that keeps the vectors it was called with."""
+    """v ↦ Hv that records its arguments."""
 
     def __init__(self, hessian):
         self.hessian = hessian
@@ -171,7 +171,7 @@ def is_rejected(problem, result):
 
 
 def step_of(problem, s):
-    """A solver's claim that s is the minimiser."""
+    """A solver's claim that s is the global minimiser."""
     s = np.asarray(s, float)
     return CubicStep(
         step=torch.from_numpy(s),
@@ -207,3 +207,22 @@ def oracle_decrease(eigenvalues, gamma, alpha):
         lam = shift + high
         # m(s) = -½ Σγ²/(λ_i + λ) - (1/12)α‖s‖³, also in the hard case, with ‖s‖ = λ/ρ
         return float(squares(lam, 1) / 2 + rho / 6 * (lam / rho) ** 3)
+
+
+def large(dim=300, seed=0, eigenvalues=None, hide=0, alpha=1.0, size=1.0):
+    """A rotated problem, ‖g‖ ≈ size, whose ``hide`` leftmost eigenvectors are orthogonal to g."""
+    rng = np.random.default_rng(seed)
+    if eigenvalues is None:
+        eigenvalues = np.sort(rng.standard_normal(dim))
+    gamma = rng.standard_normal(dim) * size / np.sqrt(dim)
+    gamma[:hide] = 0
+    return spectral(f"large {seed}", eigenvalues, gamma, alpha, seed)
+
+
+SPECTRA = {
+    "decaying": np.r_[-0.5, np.logspace(0, -8, 299)],
+    "outlier": np.r_[-10.0, np.linspace(-1, 1, 299)],
+    "barely lower": np.r_[-1.001, np.linspace(-1, 1, 299)],
+    "clusters": np.repeat([-1.0, -0.5, 3.0], 100),
+    "low rank": np.r_[-2.0, np.zeros(290), np.arange(1.0, 10)],
+}

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from sb3_crpn.cubic import leftmost_eigenvalues
+from sb3_crpn.cubic import krylov_basis, leftmost_eigenvalues
+from tests.cubic.problems import SPECTRA, large
 
 
 def symmetric(eigenvalues, seed=0):
@@ -73,3 +74,42 @@ def test_wrong_arguments_are_named(wrong, name):
     arguments = {"matvec": lambda v: v, "like": np.ones(3), **wrong}
     with pytest.raises(ValueError, match=f"leftmost_eigenvalues: {name}"):
         leftmost_eigenvalues(**arguments)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 15, 60])
+@pytest.mark.parametrize("spectrum", [None, *SPECTRA])
+def test_basis_is_orthonormal_and_spans_the_krylov_space(dim, spectrum):
+    problem = large(eigenvalues=SPECTRA.get(spectrum))
+    hvp = problem.hvp()
+    Q, AQ = krylov_basis(hvp, problem.gradient, dim)
+    torch.testing.assert_close(AQ, hvp.hessian @ Q)
+    k = Q.shape[1]
+    assert Q.shape == (problem.dim, k)
+    assert k <= dim
+    torch.testing.assert_close(Q.T @ Q, torch.eye(k, dtype=Q.dtype), atol=1e-13, rtol=0)
+    assert torch.equal(torch.stack(hvp.calls, 1), Q)  # once per column, in order
+    # A maps each column but the last into the space: it is a Krylov space, and starts at g
+    outside = hvp.hessian @ Q - Q @ (Q.T @ (hvp.hessian @ Q))
+    assert outside[:, :-1].norm() <= 1e-11
+    g = torch.from_numpy(problem.gradient)
+    torch.testing.assert_close(Q[:, 0], g / g.norm())
+
+
+def test_basis_stops_at_breakdown():
+    problem = large(eigenvalues=SPECTRA["clusters"])
+    for operator, start, dim, shape in [
+        (problem.hvp(), problem.gradient, 50, (300, 3)),
+        (lambda v: 0 * v, np.ones(5), 3, (5, 1)),
+        (lambda v: v, np.ones(1), 3, (1, 1)),
+        (lambda v: v, np.ones(2), 10**15, (2, 1)),  # ends at once
+        (lambda v: v, np.zeros(4), 3, (4, 0)),
+    ]:
+        Q, AQ = krylov_basis(operator, start, dim)
+        assert Q.shape == AQ.shape == shape
+
+
+def test_basis_checks_its_input():
+    with pytest.raises(ValueError, match="krylov_basis: dim=0"):
+        krylov_basis(lambda v: v, np.ones(3), 0)
+    with pytest.raises(ValueError, match="start has 1 NaN"):
+        krylov_basis(lambda v: v, [np.nan, 1.0], 2)

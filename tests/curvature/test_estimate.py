@@ -15,7 +15,7 @@ CRITIC = torch.tensor([[0.5, 1.0, 1.5]])
 
 def repeated_estimates(mdp, **arguments):
     """Gradients [n, d] and Hessians [n, d, d] of independent estimates at a θ ≠ 0."""
-    model = tabular_crpn(mdp, n_envs=8, **arguments)
+    model = tabular_crpn(mdp, n_envs=40, **arguments)  # four episodes each
     theta = random_parameters(mdp)
     model.actor.assign(theta)
     with torch.no_grad():

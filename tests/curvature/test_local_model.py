@@ -19,7 +19,7 @@ from tests.policies import frozen_episodes, small_policy
 ALPHA = 3.0
 METRICS = pytest.mark.parametrize("metric", [Euclidean(), Fisher(0.1)], ids=["euclidean", "fisher"])
 LENGTHS = (3, 1, 4, 2, 5, 3)
-# what a solver that spent 7 products reports
+# the result of a solver with 7 products
 STEP = CubicStep(torch.zeros(1), 0.0, 0.0, 7, 0.0, True, "", -2.5)
 
 
@@ -157,7 +157,7 @@ MIXING = torch.tensor([[2.0, -1.5], [0.3, 0.7]], dtype=torch.float64)
 
 
 def change_of_outputs(kind, mixing, metric):
-    """How a cubic step changes the outputs of the linear policy z = W (P x) + b, [T, …]."""
+    """The change by a cubic step of the outputs of the linear policy z = W (P x) + b, [T, …]."""
     policy, actor = small_policy(kind, net_arch=(), mixing=mixing)
     with torch.no_grad():
         policy.action_net.weight.copy_(policy.action_net.weight @ torch.linalg.inv(mixing))

@@ -48,7 +48,7 @@ def symmetric(*shape):
 
 @pytest.mark.parametrize("cheap", [False, True])
 def test_forms_and_krylov_spaces_are_those_of_the_matrices(cheap):
-    """Two terms of every result, as two ranks hold them."""
+    """Two terms of every sum, one for each of two ranks."""
     matrices, sizes = symmetric(2, 6, 6), torch.tensor([3.0, 1.0], dtype=torch.float64)
     terms = (0.25 * matrices, 0.75 * matrices)
     asked = []

@@ -1,4 +1,4 @@
-"""What segments of trajectories estimate, by enumeration of all that can happen in them.
+"""Expectations of the estimates from segments, by enumeration of all paths.
 
 Every path of N steps of a small MDP that goes on for ever is an environment of one rollout, and
 counts with its probability: estimates of g and H, which are linear in the cost advantages, are
@@ -26,7 +26,7 @@ S, A = 2, 2
 
 @dataclass(frozen=True, eq=False)
 class Endless:
-    """Two states, two actions; an episode ends with probability ``stop`` and another one begins."""
+    """Two states, two actions. An episode ends with probability ``stop``. Then another begins."""
 
     initial: torch.Tensor
     transition: torch.Tensor
@@ -53,14 +53,14 @@ class Endless:
         return self.reward + after - values[:, None]
 
     def visited(self, theta, times):
-        """The distribution of state and time one step after ``times`` [N_TIMES, S], likewise."""
+        """The distribution of state and time one step after ``times``, [N_TIMES, S]."""
         policy = self.probabilities(theta)
         goes_on = torch.einsum("ts,sa,sau->tu", times, policy * (1 - self.stop), self.transition)
         ended = torch.einsum("ts,sa->", times, policy * self.stop)
         return torch.cat([(ended * self.initial)[None], goes_on[:-1]])
 
     def stationary(self, theta):
-        """That of state and time in the long run, and an episode's mean length."""
+        """The stationary distribution of state and time, and the mean length of an episode."""
         flow = torch.zeros(N_TIMES, S, dtype=torch.float64)
         flow[0] = self.initial
         policy = self.probabilities(theta)
@@ -123,7 +123,7 @@ def paths(start, n_steps):
 
 
 def expected(start, n_steps, *, kappa=0.0, gae_lambda=0.95, discount_visitation=True):
-    """E[g] and E[H] of a rollout of ``n_steps`` that begins as ``start`` says, [d] and [d, d]."""
+    """E[g] and E[H], [d] and [d, d], of ``n_steps`` from the initial distribution ``start``."""
     times, weights, states, actions, dones = paths(start, n_steps)
     assert weights.sum() == pytest.approx(1.0, abs=1e-9)
     policy, actor = exact_policy()
@@ -166,7 +166,7 @@ def discounted(visits, discount_visitation=True):
 
 
 def starts():
-    """Three ways to begin a rollout: after a reset, anywhere, and in the long run."""
+    """Three initial distributions: after a reset, arbitrary, and stationary."""
     anywhere = torch.zeros(N_TIMES, S, dtype=torch.float64)
     anywhere[0, 0], anywhere[2, 1], anywhere[3, 0] = 0.2, 0.3, 0.5
     reset = torch.zeros_like(anywhere)
@@ -206,7 +206,7 @@ def test_in_the_long_run_g_is_the_gradient_of_j_divided_by_the_mean_length():
 
 
 def pair_terms(kappa, n_lags):
-    """C_k, [n_lags, d, d]: what pairs of steps k apart in one trajectory add, per step.
+    """C_k, [n_lags, d, d]: the contribution per step of pairs of steps at distance k.
 
     States have the long run's distribution, γ^i is dropped. C_0 is H's term of single steps.
     """
@@ -251,7 +251,7 @@ def test_a_cut_takes_the_pairs_across_it_and_no_others(n_steps, kappa):
 
 
 def test_the_bias_of_the_pairs_falls_as_one_over_the_length_of_segments():
-    """‖bias‖ ≤ κ/(1-κ)² c/N, c = 2 max|A| max‖σ‖²: with κ = 0.9 the pairs that count are near."""
+    """‖bias‖ ≤ κ/(1-κ)² c/N, c = 2 max|A| max‖σ‖²: κ = 0.9 limits the distance of pairs."""
     policy = MDP.probabilities(THETA)
     scores = jacobian(lambda theta: MDP.probabilities(theta).log(), THETA)
     kappa = 0.9

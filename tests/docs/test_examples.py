@@ -39,6 +39,7 @@ def test_examples_run(page, tmp_path, monkeypatch):
 def test_budgets_are_small_and_lines_are_the_page_s(tmp_path):
     page = tmp_path / "page.md"
     page.write_text(
-        "text\n```python\nlearn(100_000)\n```\n<!-- not run: no GPU -->\n```python\n1 / 0\n```\n"
+        "text\n```python\nlearn(100_000, n_episodes=50)\n```\n"
+        "<!-- not run: no GPU -->\n```python\n1 / 0\n```\n"
     )
-    assert source_of(page) == "\n\nlearn(600)\n"
+    assert source_of(page) == "\n\nlearn(600, n_episodes=8)\n"

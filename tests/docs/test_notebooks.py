@@ -7,7 +7,7 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
-from tests.docs.pages import BUDGET, ROOT, SMALL, name_of
+from tests.docs.pages import ROOT, name_of, shortened
 
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 
@@ -22,7 +22,7 @@ def run(notebook, folder):
 def test_notebooks_run(path, tmp_path):
     notebook = nbformat.read(path, as_version=4)
     for cell in notebook.cells:
-        cell.source = BUDGET.sub(SMALL, cell.source)
+        cell.source = shortened(cell.source)
     run(notebook, tmp_path)
 
 

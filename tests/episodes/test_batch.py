@@ -65,7 +65,7 @@ def test_time_and_starts_of_episodes_laid_end_to_end():
 
 
 def numbered_batch(lengths, *, is_dict=False):
-    """Every array holds the number of its step."""
+    """Every array holds the indices of its steps."""
     steps = np.arange(float(sum(lengths)))
     tensor = torch.from_numpy(steps)
     return EpisodeBatch(

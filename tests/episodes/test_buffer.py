@@ -10,7 +10,7 @@ from sb3_crpn.episodes.tracker import Segment
 N_ENVS = 2
 GAMMA, GAE_LAMBDA = 0.9, 0.8
 BOX = spaces.Box(-np.inf, np.inf, (2,), np.float32)
-# env 0: rows 0-1 and 2-6; env 1: rows 1-4; what is left counts for nothing
+# env 0: rows 0-1 and 2-6. env 1: rows 1-4. All other rows are discarded
 ENDS = [Segment(0, 0, 2, False), Segment(1, 1, 4, False), Segment(0, 2, 5, True)]
 TERMINAL_VALUES = [0.0, 0.0, 1.5]
 KEPT = [(0, 0), (1, 0), *[(t, 1) for t in range(1, 5)], *[(t, 0) for t in range(2, 7)]]
@@ -18,7 +18,7 @@ N_ROWS = 7
 
 
 def filled(observation_space=BOX, action_space=BOX, capacity=2):
-    """A buffer of N_ROWS random rows, what was put in, and the rows of the kept steps."""
+    """A buffer of N_ROWS random rows, its input, and the rows of the valid steps."""
     is_dict = isinstance(observation_space, spaces.Dict)
     buffer = (DictEpisodeRolloutBuffer if is_dict else EpisodeRolloutBuffer)(
         capacity,

@@ -24,7 +24,7 @@ def evaluated(policy, batch):
 
 
 def rollout(policy, **arguments):
-    """Episodes with the log-probabilities of ``policy``, which acts."""
+    """Episodes with the log-probabilities of the behaviour policy ``policy``."""
     batch = frozen_episodes(policy, **arguments)
     return replace(batch, log_probs=evaluated(policy, batch)[1])
 

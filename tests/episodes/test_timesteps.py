@@ -1,6 +1,6 @@
-"""Rollouts of timesteps: which steps of which trajectories, at which time, bootstrapped with what.
+"""Rollouts of timesteps: their segments, times and bootstrap values.
 
-What they estimate is tested in tests/curvature/test_segments.py.
+tests/curvature/test_segments.py tests the expectations of their estimates.
 """
 
 import gymnasium as gym
@@ -34,7 +34,7 @@ def histories(draw):
 @given(histories())
 @settings(deadline=None)
 def test_every_step_is_in_one_segment_at_its_time_in_its_trajectory(history):
-    """Trajectories are told apart here by the step, counted over all rollouts, that they began."""
+    """A trajectory is identified by its first step, counted over all rollouts."""
     dones, resets = history
     n_rollouts, n_steps, n_envs = dones.shape
     tracker, times, clock = TimestepTracker(), np.zeros(n_envs, int), 0
@@ -67,7 +67,7 @@ def test_every_step_is_in_one_segment_at_its_time_in_its_trajectory(history):
 
 
 class Clock(gym.Env):
-    """Observes the time of its episode, is rewarded with it, and ends after ``duration`` steps."""
+    """Observation and reward are the time in the episode, which ends after ``duration`` steps."""
 
     action_space = spaces.Discrete(2)
     observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float32)
@@ -88,7 +88,7 @@ class Clock(gym.Env):
 
 
 def clocks(*durations, algorithm=CRPN, early_resets=True, truncates=False, **arguments):
-    """A model whose observations are the times that its tracker has to know."""
+    """A model whose observations are the times that its tracker has to track."""
     made = [Monitor(Clock(each, truncates), None, early_resets) for each in durations]
     env = DummyVecEnv([lambda each=each: each for each in made])
     settings = {"rollout": "timesteps", "n_steps": 5, "net_arch": ()} | arguments
@@ -241,7 +241,7 @@ def test_a_trajectory_belongs_to_one_fold_whatever_the_number_of_rollouts():
 
 
 def test_one_endless_trajectory_has_no_independent_half():
-    """The Hessian's noise cannot be told: a first-order step is the safe answer."""
+    """The noise of the Hessian cannot be estimated. The step is of first order."""
     log = TrainLog()
     clocks(np.inf).learn(10, log)
     assert log["hessian_shrinkage"] == [0.0] * 2

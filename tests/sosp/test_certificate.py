@@ -8,51 +8,24 @@ import torch
 from gymnasium import spaces
 from sb3_contrib import TRPO
 from scipy.stats import binom
-from stable_baselines3 import A2C, DQN, PPO
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from benchmarks.exact import TabularEnv, assign_actor, coordination_mdp, random_mdp
+from benchmarks.exact import TabularEnv, coordination_mdp, random_mdp
 from sb3_crpn import ACRPN, CRPN, PAPER
 from sb3_crpn.sosp import SospReport, certify_sosp
 from sb3_crpn.theory import Constants, softmax_linear
 from tests.envs import Sampler
+from tests.sosp.problems import SADDLE, blind, optimised, saddle, tabular
 
-SADDLE = torch.zeros(6, dtype=torch.float64)
 LAMBDA_MIN = -1.5  # at the saddle of the coordination MDP
 # λ_max of the Fisher matrix of its two steps, features (1, 0, 1) and (0, 1, 1), π = ½: ½ · 3
 FISHER = 1.5
 
 
-def tabular(mdp, theta, algorithm=PPO, **arguments):
-    """A model whose policy is softmax-linear with the given parameters."""
-    options = {"gamma": mdp.gamma, "policy_kwargs": {"net_arch": []}, "seed": 0, **arguments}
-    model = algorithm("MlpPolicy", TabularEnv(mdp), device="cpu", **options)
-    assign_actor(model.policy, theta)
-    return model
-
-
-def saddle(algorithm=PPO, **arguments):
-    return tabular(coordination_mdp(), SADDLE, algorithm, **arguments)
-
-
-def blind():
-    """An MDP whose best policy is random: states that look alike. The optimum lies inside."""
-    return random_mdp(26, n_states=4, n_observations=1, horizon=4, gamma=1.0)
-
-
-def optimised(mdp, n_steps=300):
-    theta = torch.randn(
-        mdp.n_parameters, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
-    )
-    for _ in range(n_steps):
-        theta = theta - mdp.gradient(theta)
-    return theta
-
-
 @pytest.mark.parametrize("algorithm", [PPO, A2C, TRPO, CRPN, ACRPN])
 def test_a_strict_saddle_is_told_from_its_episodes(algorithm):
-    report = certify_sosp(saddle(algorithm), 400, epsilon=0.5, rho=1.0, seed=0)
+    report = certify_sosp(saddle(algorithm, n_envs=20), 400, epsilon=0.5, rho=1.0, seed=0)
     assert isinstance(report, SospReport)
     assert report.verdict == "saddle"
     assert report.gradient_norm.lower == pytest.approx(0.0, abs=0.2)
@@ -64,7 +37,7 @@ def test_a_strict_saddle_is_told_from_its_episodes(algorithm):
 
 def test_the_escape_direction_lowers_the_cost():
     mdp = coordination_mdp()
-    direction = certify_sosp(saddle(), 200, epsilon=0.5, rho=1.0, seed=0).escape_direction
+    direction = certify_sosp(saddle(n_envs=20), 200, epsilon=0.5, rho=1.0, seed=0).escape_direction
     assert direction.norm() == pytest.approx(1.0)
     assert direction @ mdp.hessian(SADDLE) @ direction < 0.9 * LAMBDA_MIN
     assert mdp.cost(SADDLE + 0.5 * direction) < mdp.cost(SADDLE) - 0.1
@@ -84,7 +57,7 @@ def test_a_steep_policy_is_not_stationary():
         mdp.n_parameters, dtype=torch.float64, generator=torch.Generator().manual_seed(5)
     )
     norm = mdp.gradient(theta).norm().item()
-    report = certify_sosp(tabular(mdp, theta), 1000, epsilon=0.3 * norm, rho=1.0, seed=0)
+    report = certify_sosp(tabular(mdp, theta, n_envs=50), 1000, epsilon=0.3 * norm, rho=1.0, seed=0)
     assert report.verdict == "not stationary"
     assert report.gradient_norm.lower <= norm <= report.gradient_norm.upper
 
@@ -92,7 +65,7 @@ def test_a_steep_policy_is_not_stationary():
 def test_an_optimised_policy_is_an_sosp():
     mdp = blind()
     theta = optimised(mdp)
-    report = certify_sosp(tabular(mdp, theta), 1000, epsilon=0.5, rho=1.0, seed=0)
+    report = certify_sosp(tabular(mdp, theta, n_envs=100), 2000, epsilon=0.5, rho=1.0, seed=0)
     assert mdp.is_sosp(theta, 0.5, 1.0)
     assert report.verdict == "sosp"
 
@@ -106,7 +79,7 @@ def test_estimates_are_unbiased_for_a_biased_training_configuration(theta):
     """Mean over certificates against the exact derivatives."""
     mdp = random_mdp(2)
     theta = theta.new_tensor(np.resize(theta.numpy(), mdp.n_parameters))
-    model = tabular(mdp, theta, CRPN, gae_lambda=0.5, hessian_lambda=0.0)
+    model = tabular(mdp, theta, CRPN, n_envs=5, gae_lambda=0.5, hessian_lambda=0.0)
     gradients = torch.stack(
         [certify_sosp(model, 20, epsilon=1.0, seed=seed).gradient for seed in range(20)]
     )
@@ -164,7 +137,7 @@ def test_the_intervals_depend_on_no_threshold():
 
 
 def thresholds_of_an_adversary(report):
-    """Those that the intervals just decide, every verdict in turn: chosen from the same data."""
+    """Thresholds at the limits of the intervals, from the same data, for every verdict."""
     of_gradient, of_curvature = report.gradient_norm, report.lambda_min
     for epsilon in (0.999 * of_gradient.lower, of_gradient.upper, 2.0 * of_gradient.upper):
         for curvature in (of_curvature.lower, 0.999 * of_curvature.upper, -1e-3):
@@ -173,13 +146,13 @@ def thresholds_of_an_adversary(report):
 
 
 def test_thresholds_chosen_from_the_same_episodes_keep_the_confidence():
-    """Default and adversary's: wrong with probability 1 - confidence at most."""
+    """Default and adversarial thresholds: wrong with probability 1 - confidence at most."""
     mdp, n, confidence = coordination_mdp(), 12, 0.8
     wrong, decided = 0, set()
     for theta in ([1.0, -1.0, 0.0, 0.0, 0.0, 0.0], [0.5, 0.5, -0.5, -0.5, 0.0, 0.0]):
         theta = torch.tensor(theta, dtype=torch.float64)
         norm, lowest = mdp.gradient(theta).norm(), torch.linalg.eigvalsh(mdp.hessian(theta))[0]
-        model = tabular(mdp, theta)
+        model = tabular(mdp, theta, n_envs=10)
         model.get_env().seed(0)
         for seed in range(n):
             report = certify_sosp(model, 40, confidence=confidence, seed=seed)
@@ -205,7 +178,7 @@ def test_undecided_says_how_many_episodes_would_decide():
     assert few.verdict == "undecided"
     needed = few.episodes_to_decide
     assert f"about {needed:,} episodes would decide" in str(few)
-    many = certify_sosp(saddle(), 2 * needed, epsilon=0.3, rho=1.0, seed=0)
+    many = certify_sosp(saddle(n_envs=20), 2 * needed, epsilon=0.3, rho=1.0, seed=0)
     assert 40 < needed < 4000
     assert many.verdict == "saddle"
     assert many.episodes_to_decide is None
@@ -279,7 +252,7 @@ def test_the_same_seed_gives_the_same_certificate():
 
 def test_the_model_is_left_as_it_was():
     env = VecNormalize(DummyVecEnv([lambda: gym.make("CartPole-v1")]))
-    model = PPO("MlpPolicy", env, seed=0, device="cpu")
+    model = PPO("MlpPolicy", env, seed=0, device="cpu", n_steps=64)
     before = [p.clone() for p in model.policy.parameters()]
     state, mean = torch.get_rng_state(), model.env.obs_rms.mean.copy()
     model.policy.set_training_mode(True)
@@ -290,18 +263,6 @@ def test_the_model_is_left_as_it_was():
     assert torch.equal(state, torch.get_rng_state())
     np.testing.assert_array_equal(mean, model.env.obs_rms.mean)
     model.learn(64)
-
-
-class InRollout(BaseCallback):
-    def _on_step(self):
-        with pytest.raises(RuntimeError, match="middle of a rollout"):
-            certify_sosp(self.model, 4, epsilon=1.0)
-        return self.n_calls < 3
-
-
-@pytest.mark.parametrize("algorithm", [PPO, CRPN])
-def test_a_rollout_in_progress_is_not_broken(algorithm):
-    saddle(algorithm).learn(20, InRollout())
 
 
 @pytest.mark.parametrize(
@@ -326,16 +287,6 @@ def test_wrong_arguments_are_named(wrong):
         certify_sosp(saddle(), **arguments)
 
 
-def test_models_without_a_stochastic_actor_are_refused():
-    with pytest.raises(ValueError, match="DQNPolicy"):
-        certify_sosp(DQN("MlpPolicy", "CartPole-v1", buffer_size=10), 4, 1.0)
-
-
-def test_environments_of_other_spaces_are_refused():
-    with pytest.raises(ValueError, match="Observation spaces do not match"):
-        certify_sosp(saddle(), 4, 1.0, env=gym.make("CartPole-v1"))
-
-
 def test_an_endless_episode_is_an_error(monkeypatch):
     monkeypatch.setattr("sb3_crpn.episodes.collector.ENDLESS", 30)
     endless = Sampler(spaces.Box(-1.0, 1.0, (2,)), spaces.Discrete(2), length=10**9)
@@ -344,31 +295,3 @@ def test_an_endless_episode_is_an_error(monkeypatch):
         certify_sosp(model, 4, 1.0)
     horizon = CRPN("MlpPolicy", endless, device="cpu", horizon=5)
     assert certify_sosp(horizon, 4, 1.0).n_steps == 20
-
-
-def test_the_report_reads_and_draws():
-    report = certify_sosp(saddle(), 400, epsilon=0.5, rho=1.0, seed=0)
-    text = str(report)
-    assert text.startswith("saddle: ε = 0.5")
-    assert "95% confidence (bootstrap)" in text
-    assert f"{report.lambda_min.estimate:.3g}" in text
-    assert "thresholds  ε given, ρ given" in text
-    assert "\n" not in repr(report)
-    assert repr(report).startswith("SospReport(saddle: ‖∇J‖ = ")
-    assert repr(report.lambda_min) == f"Interval({report.lambda_min})"
-    figure = report.plot()
-    assert len(figure.axes) == 3
-    figure.canvas.draw()
-
-
-@pytest.mark.parametrize("rho", [1.0, 1e6], ids=["near", "far"])
-def test_the_density_shows_every_ritz_value_within_limits(rho):
-    report = certify_sosp(saddle(), 8, epsilon=0.5, rho=rho, seed=0)
-    axes = report.plot().axes[2]
-    assert axes.get_ylabel()
-    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-    values = report.spectrum.values
-    assert left < values[0] < values[-1] < right < left + 3.0 * (values[-1] - values[0]) + 2.0
-    ends = np.concatenate([line.get_xydata() for line in axes.lines if line.get_marker() == "o"])
-    assert sorted(ends[:, 0]) == pytest.approx(sorted(values))
-    assert np.all((bottom < ends[:, 1]) & (ends[:, 1] < top))

@@ -19,7 +19,7 @@ def policy_of(env, **arguments):
 
 
 def rewards_of(batch):
-    """Replay the walk: the rewards of the batch's actions."""
+    """The rewards of the batch's actions, by a replay of the walk."""
     rewards, env = [], Drift()
     for action, first in zip(batch.actions, episode_time(batch.lengths) == 0, strict=True):
         if first:
@@ -42,7 +42,7 @@ def test_weights_are_discounted_costs_to_go(horizon):
 
 
 def test_every_environment_has_its_quota():
-    """The policy that ends episodes soonest is not favoured: environments deliver equally many."""
+    """Short episodes are not favoured: environments have equal quotas."""
     env = DummyVecEnv([Drift, partial(Drift, bound=0.2)])
     batch = collect_episodes(policy_of(env), env, 10, gamma=GAMMA)
     assert (batch.lengths == 1).sum() == 5

@@ -10,7 +10,7 @@ from sb3_crpn.sosp import certify_sosp
 from sb3_crpn.sosp import model_covariance as module
 from sb3_crpn.sosp.model_covariance import model_covariance
 from tests.policies import flat_gradient, frozen_episodes, small_policy
-from tests.sosp.test_certificate import tabular
+from tests.sosp.problems import tabular
 
 GAMMA = 0.9
 N_BLOCKS = 2
@@ -40,7 +40,7 @@ def expectation(weighted_scores):
 
 
 def nodes(kind, distribution, log_prob_gradient):
-    """Actions with probabilities: all of them, or for a Gaussian those of an exact quadrature."""
+    """All actions with probabilities, or the nodes of an exact quadrature for a Gaussian."""
     if kind != "gaussian":
         for action in ACTIONS[kind]:
             log_prob = distribution.log_prob(action[None])
@@ -90,7 +90,7 @@ def test_the_rarest_actions_count_with_the_cost_to_go(monkeypatch):
 
 @pytest.mark.parametrize("baseline", [0.0, 0.97])
 def test_a_nearly_deterministic_policy_is_not_certified_by_episodes_that_agree(baseline):
-    """Half of such samples show none of the actions that make J slope and bend."""
+    """Half of such samples contain no action with gradient and curvature."""
     mdp = coordination_mdp()
     theta = torch.tensor([2.5, -2.5, -2.5, 2.5, 0.0, 0.0], dtype=torch.float64)
     slope = mdp.gradient(theta).norm().item()

@@ -63,7 +63,7 @@ def test_the_density_has_the_moments_of_the_spectrum():
 
 
 def test_more_probes_find_what_one_start_is_blind_to():
-    """An operator on two invariant halves: a start inside one of them sees only that half."""
+    """An operator with two invariant subspaces. A start in one of them spans only that one."""
     d = 40
     matrix = torch.diag(torch.linspace(-1.0, 1.0, d, dtype=torch.float64))
     single = spectrum_of(matrix, n_steps=3)

@@ -62,7 +62,7 @@ def test_defaults_fill_in_what_is_not_given(given, expected):
 
 def test_slope_and_curvature_change_the_return_by_a_tenth_over_the_distance():
     chosen = choose_thresholds(None, None, None, lambda: SCALES)
-    s = SCALES.distance
+    s = SCALES.step_norm
     assert chosen.epsilon * s == pytest.approx(2.0)
     assert 0.5 * math.sqrt(chosen.rho * chosen.epsilon) * s**2 == pytest.approx(2.0)
 
@@ -111,5 +111,5 @@ def test_the_debiased_norm_is_free_of_the_bias_of_noise():
         squares.append(debiased_norm(sample) ** 2)
     assert sum(naive) / 400 > 5.0
     assert debiased_norm(truth.expand(4, -1)) == pytest.approx(1.0)
-    # negative squares are cut at 0, so that some bias is left
+    # negative squares are clipped at 0, which leaves some bias
     assert 0.5 < sum(squares) / 400 < 5.0

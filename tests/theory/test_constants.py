@@ -103,7 +103,7 @@ def test_estimates_of_single_episodes_hold(estimator):
 
 
 def test_estimates_of_single_episodes_are_attained():
-    """Improbable actions in one state, each of reward -K: all scores and all costs align."""
+    """Improbable actions in one state, each with the reward -K: scores and costs are aligned."""
     policy, actor = small_policy("discrete", net_arch=())
     actor.assign(torch.zeros(len(actor)))
     with torch.no_grad():

@@ -61,7 +61,7 @@ def test_the_printed_discounts_add_up_to_more_than_the_horizon():
 
 
 def printed_finalsolver(gradient, hessian, rho, lipschitz, epsilon, max_steps):
-    """Algorithm 2's Finalsolver to the letter: ḡ_J ← ḡ_J + H[Δ] + (ρ/2)‖Δ‖Δ."""
+    """Algorithm 2's Finalsolver as printed: ḡ_J ← ḡ_J + H[Δ] + (ρ/2)‖Δ‖Δ."""
     step, slope = np.zeros_like(gradient), gradient.copy()
     for _ in range(max_steps):
         if np.linalg.norm(slope) < epsilon / 2:
@@ -93,7 +93,7 @@ def test_the_printed_finalsolver_may_stop_but_hardly_ever_at_a_small_slope():
 
 
 def test_the_printed_number_of_inner_steps_depends_on_the_unit_of_reward():
-    """Costs in cents in place of euros change ε, and nothing else that is counted."""
+    """Costs in cents in place of euros change ε, and no other number."""
     cents = replace(UNIT, K=100.0)
     theirs = [printed_approximate_recipe(p, 0.01 * p.K, 0.5) for p in (UNIT, cents)]
     assert [recipe.kwargs["subsolver_steps"] for recipe in theirs] == [10, 1]
@@ -102,7 +102,7 @@ def test_the_printed_number_of_inner_steps_depends_on_the_unit_of_reward():
 
 
 def test_the_printed_number_of_inner_steps_misses_a_saddle():
-    """λ_min = -2√(ρε) and g = 0: Algorithm 2 would end here, at a point that is no ε-SOSP."""
+    """λ_min = -2√(ρε) and g = 0: Algorithm 2 would stop here, at a point that is not an ε-SOSP."""
     problem = Constants(1.0, softmax_linear(1.0), 2, 6)
     recipe = printed_approximate_recipe(problem, 0.02, 0.05)
     rho, epsilon = recipe.rho, recipe.epsilon

@@ -1,4 +1,4 @@
-"""The paper's lemmas, as inequalities between numbers that are known exactly."""
+"""The paper's lemmas, as inequalities between exactly known numbers."""
 
 import itertools
 
@@ -67,7 +67,7 @@ def test_a_long_step_pays(seed, size):
 
 @pytest.mark.parametrize("seed", range(20))
 def test_an_order_of_matrices_bounds_the_largest_eigenvalue(seed):
-    """Lemmas 6 and 12: A ⪯ B + cI, with the least such c, implies c ≥ λ_max(A) - ‖B‖."""
+    """Lemmas 6 and 12: A ⪯ B + cI, with the smallest such c, implies c ≥ λ_max(A) - ‖B‖."""
     A, B = np.random.default_rng(seed).normal(size=(2, 4, 4))
     A, B = A + A.T, B + B.T
     least = np.linalg.eigvalsh(A - B)[-1]
@@ -75,7 +75,7 @@ def test_an_order_of_matrices_bounds_the_largest_eigenvalue(seed):
 
 
 def atoms(seed):
-    """A random matrix with three equally likely values, one of them far out."""
+    """A random matrix with three equally likely values, one of them an outlier."""
     values = np.random.default_rng(seed).normal(size=(3, 3, 3))
     values[0] *= 4.0
     return values
@@ -87,7 +87,7 @@ def fourth_moment(values):
 
 @pytest.mark.parametrize("seed", range(20))
 def test_centring_costs_at_most_five_in_the_fourth_moment(seed):
-    """Lemma 13, in the Frobenius norm, for which its proof is."""
+    """Lemma 13, in the Frobenius norm of its proof."""
     values = atoms(seed)
     assert fourth_moment(values - values.mean(0)) <= 5 * fourth_moment(values)
 

@@ -1,4 +1,4 @@
-"""The paper's printed formulas against numbers worked out by hand from its text."""
+"""The paper's printed formulas against numbers computed by hand from its text."""
 
 import math
 from dataclasses import replace
@@ -36,7 +36,7 @@ BY_HAND = {
 }
 # All constants 1, d = 4: G_g = 1, M_1 = 2, G_H = 2, M_2 = 4, L_H = 1 + 3 + 1, 1 + 2 log 2d = 5.16
 UNIT = Constants(1.0, ScoreBounds(1.0, 1.0, 1.0), H=1, d=4)
-# What corresponds: the text's M_H bounds the gradient
+# Corresponding constants. The text's M_H bounds the gradient
 PAIRS = {"M_H": "M_g", "G_H": "M_H", "L_H": "L_H", "G_g": "G_g", "M_1": "M_1", "M_2": "M_2"}
 
 

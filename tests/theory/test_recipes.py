@@ -33,8 +33,8 @@ each = pytest.mark.parametrize("recipe", RECIPES.values(), ids=RECIPES)
 class Coordination(Constants):
     """Two players who must agree, J = -tanh(x_1/2) tanh(x_2/2), x the differences of logits.
 
-    θ = 0 is a strict saddle, ∇J = 0 and λ_min = -1/2. Its own Lipschitz constant stands for the
-    far larger L_H of all two-step problems, so that the theorems are put to the test.
+    θ = 0 is a strict saddle, ∇J = 0 and λ_min = -1/2. L_H is the Lipschitz constant of this
+    problem in place of the far larger one of all two-step problems, for a tight test.
     """
 
     L_H = 0.71
@@ -65,7 +65,7 @@ def is_sosp(theta):
 
 
 def steps_with_errors(errors, alpha, seed):
-    """Cubic steps from the saddle, with errors of just these norms in g and H: (step, θ after)."""
+    """Cubic steps from the saddle, with errors of these norms in g and H: (step, θ after)."""
     rng, theta = np.random.default_rng(seed), np.zeros(4)
     while True:
         gradient, hessian = COORDINATION.derivatives(theta)
@@ -86,7 +86,7 @@ def errors_of(recipe_errors, factor=1.0):
 
 
 def first_short_step(seed, factor=1.0):
-    """The number of the first step no longer than the recipe's threshold, and the θ after it."""
+    """The index of the first step not longer than the recipe's threshold, and θ after it."""
     recipe = high_probability_recipe(COORDINATION, EPSILON, 0.05, initial_gap=1.0)
     steps = steps_with_errors(errors_of((3 / 64, 1 / 16), factor), recipe.kwargs["alpha"], seed)
     for number, (step, theta) in enumerate(islice(steps, recipe.n_updates), start=1):
@@ -108,7 +108,7 @@ def test_errors_far_beyond_the_allowed_ones_keep_steps_long():
 
 
 def test_the_approximate_algorithm_stops_at_an_sosp():
-    """With the exact minimiser in place of both inner descents."""
+    """Both inner descents are replaced by the exact minimiser."""
     recipe = approximate_recipe(COORDINATION, EPSILON, 0.05, initial_gap=1.0)
     enough = math.sqrt(EPSILON**3 / recipe.rho) / 100.0
     for seed in range(10):
@@ -140,7 +140,7 @@ MODELS = {
 
 @pytest.mark.parametrize("name", MODELS)
 def test_the_inner_descent_attains_nine_tenths(name):
-    """What `approximate_recipe` supposes, at models that hardly allow a decrease of 0.02289."""
+    """The assumption of `approximate_recipe`, for models whose largest decrease is just 0.02289."""
     recipe = approximate_recipe(BANDIT, BANDIT.M_H**2 / BANDIT.L_H, 0.05)
     curvatures, gradient = np.array(MODELS[name][0]), np.array(MODELS[name][1])
     ratio = recipe.kwargs["gradient_lipschitz"] / math.sqrt(recipe.rho * recipe.epsilon)
@@ -180,7 +180,7 @@ def fine_logarithm(coarse, fine):
 
 @each
 def test_units(recipe):
-    """Units of reward and of θ change α, ε, ℓ and the step's length, but no number of anything."""
+    """Units of reward and of θ change α, ε, ℓ and the step's length, but no count."""
     scores = ScoreBounds(1.5, 2.0, 3.0)
     plain = recipe(Constants(1.0, scores, 3, 5, 0.9), 0.01)
     counts = {"n_episodes", "n_hessian_episodes", "subsolver_steps"} & plain.kwargs.keys()

@@ -24,7 +24,7 @@ def parameters(mdp, seed=0):
 
 
 def policy(mdp, theta):
-    """π(a|o), [O, A], written out."""
+    """π(a|o), [O, A], from its definition."""
     weight, bias = np.split(theta.numpy(), [-mdp.n_actions])
     logits = np.exp(weight.reshape(mdp.n_actions, -1).T + bias)
     return logits / logits.sum(1, keepdims=True)
