@@ -2,17 +2,17 @@
 
     python -m benchmarks.experiments.reuse
 
-Random MDPs with four states and random ends of episodes; γ = 1, the exact critic, λ = 0.95, κ = 0.9.
-A policy simulates episodes, then takes natural-gradient steps of a KL divergence each by the exact
-gradient. After some steps the episodes are reused:
+Random MDPs with four states and random ends of episodes; γ = 1, λ = 0.95, κ = 0.9, and the exact
+critic.
+A policy simulates episodes, then takes natural-gradient steps by the exact gradient, of a fixed KL
+divergence each. After some steps the episodes are reused, with clipped traces, and weighted by
 
-- ``today``: as CRPN does, by the ratio of each action and clipped traces, states as they are;
-- ``visitation``: the steps before count too, weights exp(clip(Σ_{i<j} log ρ_i, ±c)) of mean 1, for
-  several c;
-- ``pairs``: in H, the ratio of the earlier action of a pair of steps counts too;
-- ``both``.
+- ``later action``: the ratio of each step's action; in H, of the later action of a pair of steps;
+- ``both actions``: in H the ratio of the earlier action too, as CRPN does;
+- ``visitation``: the later action's, and for the states that the old policy visited
+  exp(clip(Σ_{j<i} log ρ_j, ±c)), of mean 1, for several c.
 
-Errors are relative to what fresh episodes estimate on average, by dynamic programming.
+Errors are relative to what fresh episodes estimate on average, which is known exactly.
 """
 
 from __future__ import annotations
@@ -55,9 +55,8 @@ HORIZON = 60  # episodes end by themselves long before
 KAPPA = 0.9
 KLS = (0.005, 0.02, 0.08)
 AGES = (1, 2, 3, 6)
-MAX_RATIO = 2.0
 CLIPS = (0.7, 1.5, float("inf"))
-ARMS = ("fresh", "today", *(f"visitation {clip:g}" for clip in CLIPS), "pairs", "both")
+ARMS = ("later action", "both actions", *(f"visitation {clip:g}" for clip in CLIPS))
 
 
 def jobs(seeds: int) -> list[Row]:
@@ -131,18 +130,15 @@ def errors(model: CRPN, mdp: TabularMDP, theta: Tensor, episodes: EpisodeBatch) 
     fresh = model.estimate_curvature(N_EPISODES).gradient_batch
     rows = [{"arm": "fresh", "ess": 1.0} | _moments(Derivatives(mdp, theta, fresh), truths)]
     reused, ratios = reweighted(model, episodes)
-    pairs = PairRatios(np.minimum(ratios, MAX_RATIO))
-    for arm in ARMS[1:]:
+    ess = float(ratios.sum() ** 2 / (ratios**2).sum() / len(ratios))
+    for arm in ARMS:
         batch = reused
-        if arm.startswith("visitation") or arm == "both":
-            clip = CLIPS[1] if arm == "both" else float(arm.split()[1])
-            weights = visitation_weights(ratios, reused.lengths, clip)
+        if arm.startswith("visitation"):
+            weights = visitation_weights(ratios, reused.lengths, float(arm.split()[1]))
             batch = replace(reused, cost_advantages=weights * reused.cost_advantages)
-        estimator = pairs if arm in ("pairs", "both") else Causal(KAPPA)
-        ess = float(ratios.sum() ** 2 / (ratios**2).sum() / len(ratios))
-        rows.append(
-            {"arm": arm, "ess": ess} | _moments(Derivatives(mdp, theta, batch, estimator), truths)
-        )
+        estimator = PairRatios(reused.ratios) if arm == "both actions" else Causal(KAPPA)
+        found = Derivatives(mdp, theta, batch, estimator)
+        rows.append({"arm": arm, "ess": ess} | _moments(found, truths))
     return rows
 
 
@@ -162,10 +158,12 @@ def reweighted(model: CRPN, episodes: EpisodeBatch) -> tuple[EpisodeBatch, Float
     return batch, ratios
 
 
-def visitation_weights(ratios: FloatArray, lengths: IntArray, clip: float) -> FloatArray:
-    """Return exp(clip(Σ_{i<j} log ρ_i, ±c)), divided by their mean, [T]."""
+def visitation_weights(
+    ratios: FloatArray, lengths: IntArray, clip: float, decay: float = 1.0
+) -> FloatArray:
+    """Return exp(clip(Σ_{i<j} κ^{j-i} log ρ_i, ±c)), κ = ``decay``, divided by their mean, [T]."""
     logarithms = np.log(ratios)
-    past = episode_scan(logarithms, 1.0, lengths) - logarithms
+    past = episode_scan(logarithms, decay, lengths) - logarithms
     weights: FloatArray = np.exp(np.clip(past, -clip, clip))
     return weights / weights.mean()
 
@@ -264,10 +262,10 @@ def table(rows: pd.DataFrame) -> str:
         cells = [
             f"{of_arm.loc[arm, 'bias of g']:.2f}, {of_arm.loc[arm, 'bias of H']:.2f}; "
             f"{of_arm.loc[arm, 'error of g']:.1f}, {of_arm.loc[arm, 'error of H']:.1f}"
-            for arm in ARMS[1:]
+            for arm in ARMS
         ]
-        body.append([f"{kl:g}", age, f"{of_arm.loc['today', 'ess']:.2f}", *cells])
-    return markdown(["KL a step", "steps", "effective size", *ARMS[1:]], body)
+        body.append([f"{kl:g}", age, f"{of_arm.ess.min():.2f}", *cells])
+    return markdown(["KL a step", "steps", "effective size", *ARMS], body)
 
 
 def draw(rows: pd.DataFrame) -> Figure:
@@ -287,7 +285,7 @@ def draw(rows: pd.DataFrame) -> Figure:
 
 
 def _draw(axis: Axes, biases: pd.Series) -> None:
-    for colour, arm in zip(PALETTE, ARMS[1:], strict=False):
+    for colour, arm in zip(PALETTE, ARMS, strict=False):
         curve = biases.xs(arm, level="arm")
         axis.plot(curve.index, curve, "o-", ms=3, color=colour, label=arm)
     axis.set_yscale("log")

@@ -1,9 +1,11 @@
-"""Training with reused rollouts, corrected for the states that the old policies visited or not.
+"""Training with reused rollouts, by the ratios that weight them.
 
-    python -m benchmarks.experiments.visitation
+    python -m benchmarks.experiments.reuse_training
 
-Each environment's entry at its ``target_kl`` and at four times it, with and without the Hessian.
-Seeds from 10 on, which no table of the benchmark reports.
+Each environment's entry at its ``target_kl`` and at four times it, with the Hessian and without.
+The ratios are those of `reuse`: in H of the later action of a pair of steps, or of both actions, as
+CRPN has it, or of the later action with a correction of the visited states, whose exponent forgets
+by 0.95 a step and is clipped at ±1. Seeds from 10 on, which no table of the benchmark reports.
 """
 
 from __future__ import annotations
@@ -22,21 +24,21 @@ from benchmarks.common.figures import PALETTE
 from benchmarks.common.intervals import interval
 from benchmarks.common.markdown import estimate, markdown
 from benchmarks.common.table import Row
+from benchmarks.experiments.reuse import visitation_weights
 from benchmarks.experiments.study import Study
 from benchmarks.experiments.tasks import Returns, make_model
 from benchmarks.learning.settings import resolve
 from sb3_crpn.arrays import FloatArray
 from sb3_crpn.episodes import EpisodeBatch, Replay
-from sb3_crpn.episodes.batch import episode_scan
 
 BUDGETS = {"CartPole-v1": 30_000, "Acrobot-v1": 40_000, "Pendulum-v1": 40_000}
 FIRST_SEED = 10
 FACTORS = (1, 4)
-ARMS = ("none", "pairs", "visitation")
+ARMS = ("later action", "both actions", "visitation")
 HESSIANS = ("auto", "none")
 
 
-class Uncorrected(Replay):
+class LaterAction(Replay):
     """Reused pairs of steps have the ratio of the later action alone."""
 
     def reweighted(self, policy: ActorCriticPolicy, **weighting: bool) -> list[EpisodeBatch]:
@@ -45,21 +47,18 @@ class Uncorrected(Replay):
         return [replace(batch, ratios=np.ones(batch.n_steps)) for batch in batches]
 
 
-class Visitation(Uncorrected):
+class Visitation(LaterAction):
     """Steps are weighted by exp(clip(Σ_{j<i} κ^{i-j} log ρ_j, ±1)), κ = 0.95, of mean 1."""
 
     def _reweight(
         self, batch: EpisodeBatch, values: FloatArray, ratios: FloatArray, **weighting: bool
     ) -> EpisodeBatch:
         reused = super()._reweight(batch, values, ratios, **weighting)
-        logarithms = np.log(ratios)
-        past = episode_scan(logarithms, 0.95, batch.lengths) - logarithms
-        weights = np.exp(np.clip(past, -1.0, 1.0))
-        weights /= weights.mean()
+        weights = visitation_weights(ratios, batch.lengths, 1.0, 0.95)
         return replace(reused, cost_advantages=weights * reused.cost_advantages)
 
 
-REPLAYS = {"none": Uncorrected, "pairs": Replay, "visitation": Visitation}
+REPLAYS = {"later action": LaterAction, "both actions": Replay, "visitation": Visitation}
 
 
 def jobs(seeds: int) -> list[Row]:
@@ -70,7 +69,7 @@ def jobs(seeds: int) -> list[Row]:
     return [
         {"env": env, "factor": factor, "hessian": hessian, "arm": arm, "seed": seed}
         for seed, env, factor, hessian, arm in cases
-        if (hessian, arm) != ("none", "pairs")  # pairs are the Hessian's
+        if (hessian, arm) != ("none", "both actions")  # pairs are the Hessian's
     ]
 
 
@@ -121,7 +120,7 @@ def draw(rows: pd.DataFrame) -> Figure:
     return figure
 
 
-STUDY = Study("visitation", jobs, measure, draw, seeds=5)
+STUDY = Study("reuse_training", jobs, measure, draw, seeds=5)
 
 if __name__ == "__main__":
     STUDY.main(str(__doc__))
