@@ -22,7 +22,7 @@ SELECTION = [
     "tests/test_acrpn.py",
     "tests/test_sb3_contract.py",
     "tests/test_zoo.py",
-    "-k=stop_at or load or checkpoints or vec or tensorboard or progress_bar or an_entry",
+    "-k=stop_at or load or checkpoints or vec or tensorboard or progress_bar or source_tree",
 ]
 EXTRAS = os.environ.get("MATRIX_EXTRAS", "extra,zoo")
 
