@@ -58,7 +58,7 @@ def parts(model: CRPN, n_episodes: int) -> dict[str, Callable[[], object]]:
             estimate.hessian @ vector
 
     return {
-        "collection": lambda: model._collect_evaluation_episodes(n_episodes, None),
+        "collection": lambda: model.rollouts.evaluate(model, n_episodes, None),
         "products": products,
         "update": model.train,
     }

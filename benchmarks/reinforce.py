@@ -6,7 +6,7 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_crpn.algorithm import PolicyNewtonAlgorithm
 from sb3_crpn.algorithm.declaration import configured, setting
-from sb3_crpn.algorithm.settings import CheckedSchedule
+from sb3_crpn.algorithm.settings import CheckedSchedule, checked_schedule
 from sb3_crpn.algorithm.solvers import SubproblemSolver
 from sb3_crpn.checks import NONE, POSITIVE, SCHEDULE, choice, real
 from sb3_crpn.cubic import CubicStep
@@ -56,8 +56,7 @@ class REINFORCE(PolicyNewtonAlgorithm):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        name = f"{type(self).__name__}: actor_learning_rate"
-        rate = CheckedSchedule(name, self.actor_learning_rate, POSITIVE)
+        rate = checked_schedule(self, "actor_learning_rate", POSITIVE)
         self.alpha_schedule = CheckedSchedule(
             f"{type(self).__name__}: 1/actor_learning_rate",
             lambda progress: 1.0 / rate(progress),

@@ -9,11 +9,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from operator import is_not
 from typing import Any
 
 import numpy as np
 import torch
 from gymnasium import spaces
+from gymnasium.vector.utils import create_empty_array
 from stable_baselines3.common.distributions import (
     Distribution,
     MultiCategoricalDistribution,
@@ -119,15 +121,35 @@ def find_actor_anywhere(policy: ActorCriticPolicy, space: spaces.Space[Any]) -> 
     Reachability does not depend on values, so that a distribution that is not finite there is no
     hindrance.
     """
-    zeros = _zero_observation(space)
+    zeros: Any = create_empty_array(space, 1)
     with _unvalidated_distributions():
         return find_actor(policy, policy.obs_to_tensor(zeros)[0])
 
 
-def _zero_observation(space: spaces.Space[Any]) -> Any:
-    if isinstance(space, spaces.Dict):
-        return {key: _zero_observation(subspace) for key, subspace in space.spaces.items()}
-    return np.zeros(space.shape or (), dtype=space.dtype)
+class ActorFinder:
+    """The actor of a policy, looked for anew where the policy has other trainable parameters.
+
+    The policy, or layers of it, may be replaced, frozen or unfrozen at any time.
+    """
+
+    def __init__(self) -> None:
+        self._parameters: list[nn.Parameter] = []
+        self._trainable: list[bool] | None = None
+
+    def find(
+        self, policy: ActorCriticPolicy, space: spaces.Space[Any], observations: Any
+    ) -> ActorParameters:
+        """Return the actor, found at ``observations``; ``None``: anywhere in their ``space``."""
+        parameters = list(policy.parameters())
+        trainable = [parameter.requires_grad for parameter in parameters]
+        if trainable != self._trainable or any(map(is_not, parameters, self._parameters)):
+            policy.set_training_mode(False)
+            if observations is None:
+                self._actor = find_actor_anywhere(policy, space)
+            else:
+                self._actor = find_actor(policy, to_tensor(policy, observations))
+            self._parameters, self._trainable = parameters, trainable
+        return self._actor
 
 
 @contextmanager

@@ -118,21 +118,10 @@ def _default_config(options: Sequence[str]) -> list[str]:
 def sample_crpn_params(
     trial: Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
 ) -> dict[str, Any]:
-    """Draw CRPN's hyperparameters for a trial of rl_zoo3's search, as constructor arguments."""
-    return _sample(trial)
+    """Draw CRPN's hyperparameters for a trial of rl_zoo3's search, as constructor arguments.
 
-
-def sample_acrpn_params(
-    trial: Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
-) -> dict[str, Any]:
-    """Draw ACRPN's hyperparameters: those of CRPN and N̂."""
-    return _sample(trial) | {
-        "subsolver_steps": trial.suggest_int("subsolver_steps", 10, 200, log=True)
-    }
-
-
-def _sample(trial: Trial) -> dict[str, Any]:
-    """Draw what both algorithms share, under the names and in the ranges of rl_zoo3's samplers."""
+    Names and ranges are those of rl_zoo3's samplers where these have them.
+    """
     from rl_zoo3.hyperparams_opt import convert_onpolicy_params
 
     sampled = {
@@ -154,6 +143,14 @@ def _sample(trial: Trial) -> dict[str, Any]:
     for name in ("n_steps", "batch_size", "gamma", "gae_lambda"):
         trial.set_user_attr(name, converted[name])  # the values behind powers and differences
     return converted
+
+
+def sample_acrpn_params(
+    trial: Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
+) -> dict[str, Any]:
+    """Draw ACRPN's hyperparameters: those of CRPN and N̂."""
+    shared = sample_crpn_params(trial, n_actions, n_envs, additional_args)
+    return shared | {"subsolver_steps": trial.suggest_int("subsolver_steps", 10, 200, log=True)}
 
 
 if __name__ == "__main__":

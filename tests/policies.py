@@ -67,7 +67,6 @@ def frozen_episodes(policy, lengths=(3, 1, 4, 2), seed=0):
         returns=rng.normal(size=n_steps),
         rewards=rng.normal(size=n_steps),
         log_probs=rng.normal(size=n_steps),
-        ratios=np.ones(n_steps),
         terminal_values=rng.normal(size=len(lengths)),
         times=np.zeros(len(lengths), dtype=int),
         trajectories=np.arange(len(lengths)),

@@ -15,7 +15,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_crpn import ACRPN, CRPN, PAPER
-from sb3_crpn.algorithm import update
+from sb3_crpn.algorithm import algorithm as base
 from sb3_crpn.algorithm.solvers import SubproblemSolver
 from sb3_crpn.cubic import solve_dense
 from tests.envs import Drift, Sampler
@@ -135,8 +135,8 @@ class Batches:
 
     def __init__(self, monkeypatch):
         self.sizes, self.observations, self.of_fisher = [], [], []
-        self.estimate = update.estimate_curvature
-        monkeypatch.setattr(update, "estimate_curvature", self)
+        self.estimate = base.estimate_curvature
+        monkeypatch.setattr(base, "estimate_curvature", self)
 
     def __call__(self, policy, actor, batch, estimator, **options):
         hessian_batch = options["hessian_batch"] or batch
@@ -306,7 +306,7 @@ def test_bad_steps_are_rejected_bitwise(algorithm, metric, change, target_kl, mo
     model, log = make(algorithm, metric=metric, target_kl=target_kl), TrainLog()
     earlier = tensors(model)
     monkeypatch.setattr(algorithm, "_update_solver", replaced(algorithm, change))
-    monkeypatch.setattr(model, "_fit_critic", lambda batch, earlier: None)
+    monkeypatch.setattr(model, "_fit_critic", lambda data: None)
     model.learn(20, log)
     assert log["step_rejected"] == [1] * len(log.rows)
     assert log["step_norm"] == log["kl_divergence"] == [0.0] * len(log.rows)

@@ -13,7 +13,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-import sb3_crpn.algorithm.update
+import sb3_crpn.algorithm.algorithm
 from sb3_crpn import ACRPN, CRPN
 from sb3_crpn.algorithm.critic import fit_critic
 from sb3_crpn.algorithm.evaluation import CandidateEvaluator
@@ -145,7 +145,7 @@ class Watch:
     """Keeps what a rank's running moments are updated with, and the policy after updates."""
 
     def __init__(self, monkeypatch, env):
-        update, give = RunningMeanStd.update, sb3_crpn.algorithm.update.share_policy
+        update, give = RunningMeanStd.update, sb3_crpn.algorithm.algorithm.share_policy
         self.seen, self.states = defaultdict(list), []
 
         def recorded(moments, array):
@@ -160,7 +160,7 @@ class Watch:
             give(policy)
 
         monkeypatch.setattr(RunningMeanStd, "update", recorded)
-        monkeypatch.setattr(sb3_crpn.algorithm.update, "share_policy", compared)
+        monkeypatch.setattr(sb3_crpn.algorithm.algorithm, "share_policy", compared)
 
 
 def trained(folder, algorithm, n_updates, **arguments):
@@ -183,7 +183,7 @@ def trained(folder, algorithm, n_updates, **arguments):
         "moments": {"obs": env.obs_rms, "ret": env.ret_rms},
         "timesteps": model.num_timesteps,
         "alpha": model.kl_control.alpha,
-        "length": model._mean_episode_length,
+        "length": model.rollouts.mean_episode_length,
         "actions": model.rollout_buffer.actions[:4].flatten().tolist(),
         "outputs": len(model.logger.output_formats),
         "calls": [callback.n_calls for callback in callbacks],

@@ -97,6 +97,13 @@ class MyCRPN(CRPN):
         return super()._update_target_kl(batch) / 2 ** (self._n_updates // self.halve_every)
 
 
+class FreshHessian(CRPN):
+    """H and F from the fresh rollout alone, g from the earlier ones too."""
+
+    def _estimate(self, data):
+        return self._estimate_from(data.joined, data.fresh, data.fresh)
+
+
 VARIANTS = {
     "metric": (METRICS, AbsoluteHessian),
     "hessian_estimator": (HESSIAN_ESTIMATORS, Diagonal),
@@ -172,6 +179,15 @@ def test_a_tracker_decides_what_a_rollout_keeps(tmp_path, monkeypatch):
     assert same(named, tensors(model))
     model.save(tmp_path / "model")
     assert CRPN.load(tmp_path / "model", device="cpu").rollout is AtLeast
+
+
+def test_a_part_of_the_update_is_replaced():
+    """The same until there is an earlier rollout, whose episodes H then does without."""
+    first = [make(algorithm, n_reused_rollouts=2).learn(1) for algorithm in (CRPN, FreshHessian)]
+    assert same(first[0], tensors(first[1]))
+    for model in first:
+        model.learn(100, reset_num_timesteps=False)
+    assert not same(first[0], tensors(first[1]))
 
 
 def test_an_argument_is_declared_once(tmp_path):

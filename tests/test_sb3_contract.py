@@ -251,7 +251,7 @@ class Hooks(BaseCallback):
         return True
 
     def _on_rollout_end(self):
-        assert self.locals["rollout_buffer"].used_fraction > 0
+        assert self.locals["rollout_buffer"].lengths.sum() > 0
         self.calls.append(f"rollout {self.num_timesteps} ends")
 
     def _on_training_end(self):
@@ -469,8 +469,20 @@ def test_loaded_model_goes_on_as_if_it_had_not_stopped(algorithm, settings, tmp_
     assert same(second, parameters)
     assert all(torch.equal(a, b) for a, b in zip(moments, same_moments, strict=True))
     assert second.kl_control == first.kl_control
-    assert second._mean_episode_length == first._mean_episode_length
+    assert second.rollouts.mean_episode_length == first.rollouts.mean_episode_length
     assert second._rng.random() == first._rng.random()
+
+
+def test_files_of_the_first_version_go_on(tmp_path):
+    """They hold what is now in ``rollouts`` as attributes of the model."""
+    model = make(CRPN, several(2, dim=2), n_steps=20).learn(60)
+    flat = {f"_{name}": value for name, value in vars(model.rollouts).items()}
+    vars(model).update(flat)
+    model.save(tmp_path / "model", exclude=["rollouts"])
+    loaded = CRPN.load(tmp_path / "model", env=several(2, dim=2), device="cpu")
+    assert flat.keys().isdisjoint(vars(loaded))
+    assert loaded.rollouts.mean_episode_length == model.rollouts.mean_episode_length
+    assert np.array_equal(loaded.rollouts.trajectory_times, model.rollouts.trajectory_times)
 
 
 @both

@@ -30,8 +30,8 @@ from benchmarks.experiments.steps import parabola_kl
 from benchmarks.experiments.study import Study
 from benchmarks.experiments.tasks import Returns, make_model
 from sb3_crpn import CRPN
+from sb3_crpn.algorithm.update import UpdateData
 from sb3_crpn.curvature import CurvatureEstimate
-from sb3_crpn.episodes import EpisodeBatch
 
 ENVS = ("CartPole-v1", "Pendulum-v1", "Acrobot-v1", "HalfCheetah-v5", "LunarLander-v3")
 BUDGET = 50_000
@@ -64,9 +64,10 @@ class ConfirmedCRPN(CRPN):
         self._last_step: Tensor | None = None
         super()._setup_model()
 
-    def _update(self) -> None:
+    def train(self) -> None:
+        """Update the policy, and record the step."""
         before = self.actor.vector
-        super()._update()
+        super().train()
         assert self.last_update is not None
         accepted = self.last_update.accepted
         self._last_step = self.actor.vector - before if accepted else None
@@ -76,17 +77,15 @@ class ConfirmedCRPN(CRPN):
             "next_slope": float("nan"),
         }
 
-    def _estimate(
-        self, batch: EpisodeBatch, joined: EpisodeBatch, earlier: list[EpisodeBatch]
-    ) -> CurvatureEstimate:
-        folds = CrossFit(self, batch, earlier)
+    def _estimate(self, data: UpdateData) -> CurvatureEstimate:
+        folds = CrossFit(self, data.fresh, data.earlier)
         self._record_next_slope(folds.fresh_gradient)
         record: Row = {"update": len(self.records), "timesteps": self.num_timesteps}
         confirmed = confirm_natural_step(folds) if folds.n_folds > 1 else None
         for name in ("claimed_slope", "slope", "curvature"):
             record[name] = getattr(confirmed, name, float("nan"))
         self.records.append(record)
-        return super()._estimate(batch, joined, earlier)
+        return super()._estimate(data)
 
     def _record_next_slope(self, gradient: Tensor) -> None:
         """Add this rollout's estimate of the last step to its update."""

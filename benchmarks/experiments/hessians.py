@@ -16,7 +16,8 @@ from torch import Tensor
 from benchmarks.experiments.crossfit import CrossFit, Fold
 from benchmarks.experiments.steps import step_of_kl
 from sb3_crpn import CRPN
-from sb3_crpn.curvature import HESSIAN_ESTIMATORS, CurvatureEstimate, estimate_curvature
+from sb3_crpn.algorithm.update import UpdateData
+from sb3_crpn.curvature import CurvatureEstimate
 from sb3_crpn.episodes import EpisodeBatch
 
 MAX_ORACLE_ENVS = 16
@@ -28,16 +29,10 @@ MEMORY = 0.9  # by which the values of the past fade in an update
 class FreshHessian(CRPN):
     """H from the new rollout only, g also from previous rollouts."""
 
-    def _estimate(
-        self, batch: EpisodeBatch, joined: EpisodeBatch, earlier: list[EpisodeBatch]
-    ) -> CurvatureEstimate:
-        return estimate_curvature(
-            self.policy,
-            self.actor,
-            joined,
-            HESSIAN_ESTIMATORS.resolve(self.hessian_estimator, self),
-            hessian_batch=self._hessian_batch(batch),
-            fisher_batch=batch,
+    def _estimate(self, data: UpdateData) -> CurvatureEstimate:
+        fresh = data.fresh
+        return self._estimate_from(
+            data.joined, hessian_batch=self._hessian_batch(fresh), fisher_batch=fresh
         )
 
     def _hessian_batch(self, batch: EpisodeBatch) -> EpisodeBatch:
@@ -67,7 +62,7 @@ class OracleHessian(FreshHessian):
 
     def _hessian_batch(self, batch: EpisodeBatch) -> EpisodeBatch:
         n_episodes = self.factor * batch.n_episodes
-        return self._episode_batch(self._collect_evaluation_episodes(n_episodes, self._oracle_env))
+        return self._batch(self.rollouts.evaluate(self, n_episodes, self._oracle_env))
 
 
 class ConfirmedHessian(CRPN):
@@ -89,21 +84,14 @@ class ConfirmedHessian(CRPN):
         self.choice = ("all", 0.0)
         super()._setup_model()
 
-    def _estimate(
-        self, batch: EpisodeBatch, joined: EpisodeBatch, earlier: list[EpisodeBatch]
-    ) -> CurvatureEstimate:
-        if batch.n_episodes > 1:
-            self._judge(CrossFit(self, batch, earlier))
+    def _estimate(self, data: UpdateData) -> CurvatureEstimate:
+        fresh = data.fresh
+        if fresh.n_episodes > 1:
+            self._judge(CrossFit(self, fresh, data.earlier))
             self.choice = max(self.values, key=self.values.__getitem__)
         source, self.hessian_shrinkage = self.choice
-        return estimate_curvature(
-            self.policy,
-            self.actor,
-            joined,
-            HESSIAN_ESTIMATORS.resolve(self.hessian_estimator, self),
-            hessian_batch=None if source == "all" else batch,
-            fisher_batch=batch,
-        )
+        hessian_batch = None if source == "all" else fresh
+        return self._estimate_from(data.joined, hessian_batch=hessian_batch, fisher_batch=fresh)
 
     def _judge(self, folds: CrossFit) -> None:
         """Update the exponentially weighted means with this rollout's values."""

@@ -7,8 +7,9 @@ critic.
 A policy simulates episodes, then takes natural-gradient steps by the exact gradient, of a fixed KL
 divergence each. After some steps the episodes are reused, with clipped traces, and weighted by
 
-- ``later action``: the ratio of each step's action; in H, of the later action of a pair of steps;
-- ``both actions``: in H the ratio of the earlier action too, as CRPN does;
+- ``later action``: the ratio of each step's action; in H, that of the later action of a pair of
+  steps, as CRPN does;
+- ``both actions``: in H the ratio of the earlier action too;
 - ``visitation``: the later action's, and for the states that the old policy visited
   exp(clip(Σ_{j<i} log ρ_j, ±c)), of mean 1, for several c.
 
@@ -46,6 +47,7 @@ from sb3_crpn.arrays import FloatArray, IntArray
 from sb3_crpn.curvature import Causal
 from sb3_crpn.episodes import EpisodeBatch, Replay
 from sb3_crpn.episodes.batch import episode_scan, episode_starts
+from sb3_crpn.episodes.replay import MAX_RATIO
 from sb3_crpn.policy import values_and_log_probs
 
 N_EPISODES = 5_000
@@ -136,7 +138,9 @@ def errors(model: CRPN, mdp: TabularMDP, theta: Tensor, episodes: EpisodeBatch) 
         if arm.startswith("visitation"):
             weights = visitation_weights(ratios, reused.lengths, float(arm.split()[1]))
             batch = replace(reused, cost_advantages=weights * reused.cost_advantages)
-        estimator = PairRatios(reused.ratios) if arm == "both actions" else Causal(KAPPA)
+        estimator = (
+            PairRatios(np.minimum(ratios, MAX_RATIO)) if arm == "both actions" else Causal(KAPPA)
+        )
         found = Derivatives(mdp, theta, batch, estimator)
         rows.append({"arm": arm, "ess": ess} | _moments(found, truths))
     return rows

@@ -1,11 +1,10 @@
-"""Training with reused rollouts, by the ratios that weight them.
+"""Training with reused rollouts, corrected for the states that the old policies visited or not.
 
     python -m benchmarks.experiments.reuse_training
 
-Each environment's entry at its ``target_kl`` and at four times it, with the Hessian and without.
-The ratios are those of `reuse`: in H of the later action of a pair of steps, or of both actions, as
-CRPN has it, or of the later action with a correction of the visited states, whose exponent forgets
-by 0.95 a step and is clipped at ±1. Seeds from 10 on, which no table of the benchmark reports.
+Each environment's entry at its ``target_kl`` and at four times it, with the Hessian and without. A
+reused step is weighted by exp(clip(Σ_{j<i} κ^{i-j} log ρ_j, ±c)), as in `reuse`, or not. Seeds from
+10 on, which no table of the benchmark reports.
 """
 
 from __future__ import annotations
@@ -15,10 +14,8 @@ from dataclasses import replace
 from typing import Any
 
 import matplotlib.pyplot as plt
-import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from stable_baselines3.common.policies import ActorCriticPolicy
 
 from benchmarks.common.figures import PALETTE
 from benchmarks.common.intervals import interval
@@ -28,37 +25,47 @@ from benchmarks.experiments.reuse import visitation_weights
 from benchmarks.experiments.study import Study
 from benchmarks.experiments.tasks import Returns, make_model
 from benchmarks.learning.settings import resolve
+from sb3_crpn import CRPN
 from sb3_crpn.arrays import FloatArray
 from sb3_crpn.episodes import EpisodeBatch, Replay
 
 BUDGETS = {"CartPole-v1": 30_000, "Acrobot-v1": 40_000, "Pendulum-v1": 40_000}
 FIRST_SEED = 10
 FACTORS = (1, 4)
-ARMS = ("later action", "both actions", "visitation")
+# c and κ; c = 0 corrects nothing, as CRPN
+ARMS: dict[str, tuple[float, float]] = {
+    "states as they are": (0.0, 1.0),
+    "c = 1.5, κ = 1": (1.5, 1.0),
+    "c = 1, κ = 0.95": (1.0, 0.95),
+}
 HESSIANS = ("auto", "none")
 
 
-class LaterAction(Replay):
-    """Reused pairs of steps have the ratio of the later action alone."""
+class VisitationReplay(Replay):
+    """Replay whose steps are weighted for the states that the behaviour policy visited.
 
-    def reweighted(self, policy: ActorCriticPolicy, **weighting: bool) -> list[EpisodeBatch]:
-        """Return the rollouts."""
-        batches = super().reweighted(policy, **weighting)
-        return [replace(batch, ratios=np.ones(batch.n_steps)) for batch in batches]
+    Attributes
+    ----------
+    clip, decay
+        c and κ.
+    """
 
-
-class Visitation(LaterAction):
-    """Steps are weighted by exp(clip(Σ_{j<i} κ^{i-j} log ρ_j, ±1)), κ = 0.95, of mean 1."""
+    clip: float
+    decay: float
 
     def _reweight(
         self, batch: EpisodeBatch, values: FloatArray, ratios: FloatArray, **weighting: bool
     ) -> EpisodeBatch:
         reused = super()._reweight(batch, values, ratios, **weighting)
-        weights = visitation_weights(ratios, batch.lengths, 1.0, 0.95)
+        weights = visitation_weights(ratios, batch.lengths, self.clip, self.decay)
         return replace(reused, cost_advantages=weights * reused.cost_advantages)
 
 
-REPLAYS = {"later action": LaterAction, "both actions": Replay, "visitation": Visitation}
+def replay_of(model: CRPN, arm: str) -> VisitationReplay:
+    """Return the model's replay with the weights of ``arm``."""
+    replay = VisitationReplay(model.n_reused_rollouts, model.gamma, model.gae_lambda)
+    replay.clip, replay.decay = ARMS[arm]
+    return replay
 
 
 def jobs(seeds: int) -> list[Row]:
@@ -69,7 +76,6 @@ def jobs(seeds: int) -> list[Row]:
     return [
         {"env": env, "factor": factor, "hessian": hessian, "arm": arm, "seed": seed}
         for seed, env, factor, hessian, arm in cases
-        if (hessian, arm) != ("none", "both actions")  # pairs are the Hessian's
     ]
 
 
@@ -80,7 +86,7 @@ def measure(env: str, factor: int, hessian: str, arm: str, seed: int) -> list[Ro
     if hessian == "none":
         arguments["hessian_shrinkage"] = 0.0
     model = make_model(env, seed, **arguments)
-    model.replay = REPLAYS[arm](model.n_reused_rollouts, model.gamma, model.gae_lambda)
+    model.replay = replay_of(model, arm)
     returns = Returns(BUDGETS[env])
     model.learn(BUDGETS[env], callback=returns)
     return [returns.summary()]

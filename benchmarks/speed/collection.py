@@ -42,7 +42,7 @@ def _collect(model: OnPolicyAlgorithm, kept: list[float]) -> Task:
     def run() -> float:
         before = model.num_timesteps
         model.collect_rollouts(model.env, callback, model.rollout_buffer, model.n_steps)
-        kept.append(getattr(model.rollout_buffer, "used_fraction", 1.0))
+        kept.append(model.rollouts.used_fraction if isinstance(model, CRPN) else 1.0)
         return float(model.num_timesteps - before)
 
     return Task(run)

@@ -83,7 +83,7 @@ def collect(model: PolicyNewtonAlgorithm) -> EpisodeBatch:
     """Return the next rollout as the update sees it."""
     callback = model._setup_learn(1)[1]
     model.collect_rollouts(model.env, callback, model.rollout_buffer, model.n_steps)
-    return model._episode_batch(model.rollout_buffer)
+    return model._batch(model.rollout_buffer)
 
 
 def width_for(n_parameters: int, shape: str = "HalfCheetah-v5") -> int:

@@ -1,58 +1,55 @@
-"""PolicyNewtonAlgorithm: the arguments that CRPN and ACRPN have in common."""
+"""PolicyNewtonAlgorithm: what CRPN and ACRPN have in common."""
 
 from __future__ import annotations
 
-import io
-import os
-import pathlib
-from collections.abc import Iterable, Sequence
+import inspect
+import math
+from dataclasses import fields, replace
 from functools import partial
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.policies import (
-    ActorCriticCnnPolicy,
-    ActorCriticPolicy,
-    BasePolicy,
-    MultiInputActorCriticPolicy,
-)
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_crpn.algorithm.checkpoint import (
-    load_random_state,
-    read_random_state,
-    replaced_in_one_go,
-)
-from sb3_crpn.algorithm.critic import fuse
+from sb3_crpn.algorithm.checkpoint import ResumableAlgorithm
+from sb3_crpn.algorithm.critic import fit_critic, fuse
 from sb3_crpn.algorithm.declaration import check_setting, check_settings, configured
-from sb3_crpn.algorithm.distributed_training import DistributedTraining
+from sb3_crpn.algorithm.distributed_training import share_policy
+from sb3_crpn.algorithm.evaluation import CandidateEvaluator
 from sb3_crpn.algorithm.kl_control import KLControl
-from sb3_crpn.algorithm.rollouts import warn_of_endless_episodes
-from sb3_crpn.algorithm.settings import LEARNING_RATE, CheckedSchedule
-from sb3_crpn.algorithm.update import PolicyNewtonUpdate
-from sb3_crpn.checks import POSITIVE, not_allowed
-from sb3_crpn.distributed import rank, rank_seed
+from sb3_crpn.algorithm.rollouts import TrainingRollouts, warn_of_endless_episodes
+from sb3_crpn.algorithm.settings import LEARNING_RATE, PolicyNewtonSettings, checked_schedule
+from sb3_crpn.algorithm.solvers import SubproblemSolver
+from sb3_crpn.algorithm.statistics import UpdateStats
+from sb3_crpn.algorithm.step import take_step
+from sb3_crpn.algorithm.update import UpdateData, local_model, rollout_statistics, step_statistics
+from sb3_crpn.checks import COUNT, FLAG, NONE, POSITIVE, not_allowed, requires
+from sb3_crpn.curvature import HESSIAN_ESTIMATORS, CurvatureEstimate, estimate_curvature
 from sb3_crpn.episodes import (
     TRACKERS,
     DictEpisodeRolloutBuffer,
+    EpisodeBatch,
     EpisodeRolloutBuffer,
     Replay,
     Tracker,
 )
-from sb3_crpn.episodes.observations import all_finite
 from sb3_crpn.episodes.running_moments import RunningMoments
 from sb3_crpn.parameters import ActorParameters
-from sb3_crpn.policy import find_actor, find_actor_anywhere, to_tensor
+from sb3_crpn.policy import ActorFinder, unchanged_on_error
 
-Self = TypeVar("Self", bound="PolicyNewtonAlgorithm")
+ACTION_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+_VEC_ENV = requires("a VecEnv", lambda value: isinstance(value, VecEnv))
 
 
 @configured
-class PolicyNewtonAlgorithm(PolicyNewtonUpdate):
+class PolicyNewtonAlgorithm(ResumableAlgorithm, PolicyNewtonSettings):
     """Base of the cubic-regularised policy Newton algorithms.
 
     Each update minimises the cubic model of the cost J(θ) = -E[Σ_h γ^h r_h],
@@ -74,11 +71,8 @@ class PolicyNewtonAlgorithm(PolicyNewtonUpdate):
     Reinforcement Learning, AISTATS 2024.
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": ActorCriticPolicy,
-        "CnnPolicy": ActorCriticCnnPolicy,
-        "MultiInputPolicy": MultiInputActorCriticPolicy,
-    }
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = PPO.policy_aliases
+    _collecting = False  # in the middle of a rollout
 
     def __post_init__(
         self,
@@ -90,48 +84,32 @@ class PolicyNewtonAlgorithm(PolicyNewtonUpdate):
         device: torch.device | str,
         _init_setup_model: bool,
     ) -> None:
-        self._actor: ActorParameters | None = None
-        self._actor_among: Sequence[tuple[torch.Tensor, bool]] = ()
-        self._rng = np.random.default_rng()
+        self._actors = ActorFinder()
         self.kl_control = KLControl()
-        self._saved_random_state: dict[str, Any] | None = None
+        self.rollouts = TrainingRollouts()
+        self.last_update: UpdateStats | None = None  # of this call of learn
         check = partial(check_setting, self)
         check_settings(self)
-        check("_init_setup_model", _init_setup_model)
-        if env is None and _init_setup_model:
-            raise not_allowed(
-                f"{type(self).__name__}: env", env, "an environment or a registered id"
-            )
+        if check("_init_setup_model", _init_setup_model):
+            check("env", env)
         if check("policy", policy) not in self.policy_aliases and isinstance(policy, str):
             names = ", ".join(f'"{name}"' for name in self.policy_aliases)
             raise not_allowed(f"{type(self).__name__}: policy", policy, f"{names} or a class")
+        of_sb3 = inspect.signature(OnPolicyAlgorithm).parameters
+        shared = {f.name: getattr(self, f.name) for f in fields(self) if f.name in of_sb3}
         super().__init__(
             policy,
-            env,  # type: ignore[arg-type] # None where a file is loaded
-            learning_rate=self.learning_rate,
-            n_steps=self.n_steps,
-            gamma=self.gamma,
-            gae_lambda=self.gae_lambda,
+            env,  # None where a file is loaded
+            **shared,
             ent_coef=0.0,
             vf_coef=0.0,
             max_grad_norm=0.0,
-            use_sde=self.use_sde,
-            sde_sample_freq=self.sde_sample_freq,
-            rollout_buffer_class=self.rollout_buffer_class,
             rollout_buffer_kwargs=check("rollout_buffer_kwargs", rollout_buffer_kwargs),
             stats_window_size=check("stats_window_size", stats_window_size),
-            tensorboard_log=self.tensorboard_log,
             policy_kwargs=check("policy_kwargs", policy_kwargs),
-            verbose=self.verbose if rank() == 0 else 0,
-            seed=self.seed,
             device=check("device", device),
             _init_setup_model=False,
-            supported_action_spaces=(
-                spaces.Box,
-                spaces.Discrete,
-                spaces.MultiDiscrete,
-                spaces.MultiBinary,
-            ),
+            supported_action_spaces=ACTION_SPACES,
         )
         if _init_setup_model:
             self._setup_model()
@@ -145,11 +123,11 @@ class PolicyNewtonAlgorithm(PolicyNewtonUpdate):
             )
         super()._setup_model()
         fuse(self.policy.optimizer)
-        self.alpha_schedule = CheckedSchedule(f"{type(self).__name__}: alpha", self.alpha, POSITIVE)
+        self.rollouts.adopt(vars(self))
+        self.alpha_schedule = checked_schedule(self, "alpha", POSITIVE)
         self.replay = Replay(self.n_reused_rollouts, self.gamma, self.gae_lambda)
-        self.tracker: Tracker = (
-            TRACKERS[self.rollout]() if isinstance(self.rollout, str) else self.rollout()
-        )
+        kind = TRACKERS[self.rollout] if isinstance(self.rollout, str) else self.rollout
+        self.tracker: Tracker = kind()
         if not self.tracker.whole_episodes:
             for name in ("n_episodes", "n_hessian_episodes"):
                 if (value := getattr(self, name)) is not None:
@@ -159,124 +137,164 @@ class PolicyNewtonAlgorithm(PolicyNewtonUpdate):
             warn_of_endless_episodes(self.env)
 
     def _setup_lr_schedule(self) -> None:
-        name = f"{type(self).__name__}: learning_rate"
-        self.lr_schedule = CheckedSchedule(name, self.learning_rate, LEARNING_RATE)
+        self.lr_schedule = checked_schedule(self, "learning_rate", LEARNING_RATE)
 
     @property
     def actor(self) -> ActorParameters:
-        """The parameters θ that log π depends on, looked for again where the policy has others.
+        """The parameters θ that log π depends on."""
+        return self._actors.find(self.policy, self.observation_space, self._last_obs)
 
-        The policy, or layers of it, may be replaced, frozen or unfrozen at any time.
-        """
-        present = [(tensor, tensor.requires_grad) for tensor in self.policy.parameters()]
-        if self._actor is None or not _same(present, self._actor_among):
-            self.policy.set_training_mode(False)
-            if self._last_obs is None:
-                self._actor = find_actor_anywhere(self.policy, self.observation_space)
-            else:
-                self._actor = find_actor(self.policy, to_tensor(self.policy, self._last_obs))
-            self._actor_among = present
-        return self._actor
+    @property
+    def uses_critic(self) -> bool:
+        """Whether V enters the advantages at all."""
+        bootstraps = self.bootstrap_truncated or not self.tracker.whole_episodes
+        return self.baseline or bootstraps or self.gae_lambda < 1.0 or self.n_reused_rollouts > 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Let a copy that is made in mid-rollout be in none: its environments are reset first."""
+        in_none = {"_collecting": False, "rollouts": replace(self.rollouts, interrupted=True)}
+        return vars(self) | (in_none if self._collecting else {})
 
     def _excluded_save_params(self) -> list[str]:
-        found = ["_actor", "_actor_among", "last_update"]
-        derived = ["alpha_schedule", "lr_schedule", "replay", "tracker", "ranks", "_collecting"]
-        return [*super()._excluded_save_params(), *found, *derived]
+        derived = ["alpha_schedule", "lr_schedule", "replay", "tracker", "ranks", "_actors"]
+        return [*super()._excluded_save_params(), "last_update", "_collecting", *derived]
 
-    def set_random_seed(self, seed: int | None = None) -> None:
-        """Seed Python, NumPy, PyTorch, the environments and the model's own generator.
-
-        Every rank but the first seeds them with a hash of ``seed`` and its number.
-        """
-        self._seed(None if seed is None else rank_seed(seed))
-
-    def _seed(self, seed: int | None) -> None:
-        super().set_random_seed(seed)
-        self._rng = np.random.default_rng(seed)
-
-    def learn(
-        self: Self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 1,
-        tb_log_name: str | None = None,
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> Self:
-        """Train for at least ``total_timesteps``, as SB3's algorithms do."""
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         self.replay.clear()  # the environment may be another one
         self.last_update = None
-        with torch.enable_grad():
-            return super().learn(
-                total_timesteps=total_timesteps,
-                callback=callback,
-                log_interval=log_interval,
-                tb_log_name=tb_log_name or type(self).__name__,
-                reset_num_timesteps=reset_num_timesteps,
-                progress_bar=progress_bar,
+        return super()._setup_learn(*args, **kwargs)
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: RolloutBuffer,
+        n_rollout_steps: int,
+    ) -> bool:
+        """Fill the buffer with the tracker's segments; return False if a callback asked to stop."""
+        assert isinstance(rollout_buffer, EpisodeRolloutBuffer)  # set by _setup_model
+        return self.rollouts.collect(self, env, callback, rollout_buffer, n_rollout_steps)
+
+    def train(self) -> None:
+        """Update the policy from the rollout just collected (DESIGN section 5), or not at all."""
+        with unchanged_on_error(self.policy):
+            self.policy.set_training_mode(False)
+            self._update_learning_rate(self.policy.optimizer)
+            data = self._data()
+            estimate = self._estimate(data)
+            solver = self._update_solver(data.fresh)
+            model = local_model(self, estimate, solver)
+            target_kl = self._update_target_kl(data.fresh)
+            alpha = self.alpha_schedule(self._current_progress_remaining)
+            if target_kl is not None:
+                alpha = self.kl_control.first_alpha(alpha)
+            evaluator = CandidateEvaluator(
+                self.policy, self.actor, estimate.gradient_batch, self.max_batch_timesteps
             )
+            step, accepted = take_step(evaluator, model, solver, alpha, target_kl)
+            value_loss = self._fit_critic(data)
+            if step.evaluation.finite:  # a rollout whose step was not finite is not reused
+                self.replay.append(data.fresh)
+                if target_kl is not None:
+                    self.kl_control.alpha = step.alpha
+            share_policy(self.policy)
+            self._n_updates += 1
+            self.last_update = UpdateStats(
+                **step_statistics(estimate, model, step, accepted),
+                **rollout_statistics(data, self.rollouts, self.policy),
+                n_updates=self._n_updates,
+                n_trials=evaluator.n_trials,
+                target_kl=target_kl,
+                value_loss=value_loss,
+            )
+            self.last_update.write(self.logger)
 
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
-        state, self._saved_random_state = self._saved_random_state, None
-        if self.seed is None or reset_num_timesteps:
-            state = None
-        if rank() > 0:
-            callback, progress_bar = None, False
-            self.set_logger(Logger(folder=None, output_formats=[]))
-            if state is not None and self.seed is not None:
-                self._seed(rank_seed(self.seed, self.num_timesteps))
-        normalizer = self.get_vec_normalize_env()
-        self.ranks = DistributedTraining(self.policy, normalizer)
-        moments = None if normalizer is None else RunningMoments(normalizer)
-        before = None if moments is None else moments.snapshot()
-        total_timesteps, callback = super()._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
-        if moments is not None and before is not None and not all_finite(self._last_obs):
-            moments.restore(before)
-        if state is not None and rank() == 0:
-            load_random_state(state, self.device)
-            self._rng = state["model"]
-        return total_timesteps, self.ranks.callback(callback)
+    @torch.enable_grad()
+    def estimate_curvature(
+        self, n_episodes: int, env: VecEnv | None = None, *, progress_bar: bool = False
+    ) -> CurvatureEstimate:
+        """Estimate gradient and Hessian of J at the current policy from fresh episodes.
 
-    def save(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
-    ) -> None:
-        """Save all attributes, parameters and random states in a zip file; rank 0 alone does.
+        The estimators are those of the constructor's arguments; nothing is learnt, and the
+        episodes do not count as training. With several ranks all must call, and share the episodes.
 
-        A file of that name is replaced at the end, in one go: whatever happens in between leaves
-        it intact. ``learn(reset_num_timesteps=False)`` of a loaded model with a seed restores the
-        random states, so that it goes on as if it had not stopped; loading for evaluation touches
-        nothing. The environments' own generators are theirs to save.
+        Parameters
+        ----------
+        n_episodes
+            Number of episodes, used for the gradient and for the Hessian alike.
+        env
+            Where to simulate; ``None``: the training environment.
+        progress_bar
+            Show the episodes simulated, on each rank its own; needs tqdm and rich.
         """
-        if rank() > 0:
-            return
-        self._saved_random_state = {**read_random_state(self.device), "model": self._rng}
-        try:
-            if not isinstance(path, str | os.PathLike):
-                super().save(path, exclude, include)
-                return
-            file = path if pathlib.Path(path).suffix else f"{path}.zip"  # as SB3 does
-            with replaced_in_one_go(file) as stream:
-                super().save(stream, exclude, include)
-        finally:
-            self._saved_random_state = None
+        n_episodes = COUNT("estimate_curvature: n_episodes", n_episodes)
+        env = (_VEC_ENV | NONE)("estimate_curvature: env", env)
+        show = FLAG("estimate_curvature: progress_bar", progress_bar)
+        share_policy(self.policy)
+        buffer = self.rollouts.evaluate(self, n_episodes, env, show=show)
+        return self._estimate_from(self._batch(buffer))
 
+    def _data(self) -> UpdateData:
+        """Return the episodes of this update, each rollout as the present policy sees it."""
+        fresh = self._batch(self.rollout_buffer)
+        if not self.tracker.whole_episodes:
+            fresh = replace(fresh, unit="n_steps")
+        return UpdateData(fresh, self.replay.reweighted(self.policy, **self._weighting))
 
-def _same(
-    present: Sequence[tuple[torch.Tensor, bool]], earlier: Sequence[tuple[torch.Tensor, bool]]
-) -> bool:
-    return len(present) == len(earlier) and all(
-        now is then and trainable == was_trainable
-        for (now, trainable), (then, was_trainable) in zip(present, earlier, strict=True)
-    )
+    def _batch(self, buffer: RolloutBuffer) -> EpisodeBatch:
+        assert isinstance(buffer, EpisodeRolloutBuffer)  # by _setup_model
+        return buffer.episode_batch(**self._weighting)
+
+    @property
+    def _weighting(self) -> dict[str, bool]:
+        names = ("baseline", "normalize_advantage", "discount_visitation")
+        return {name: getattr(self, name) for name in names}
+
+    def _estimate(self, data: UpdateData) -> CurvatureEstimate:
+        """Estimate g from m_k and H from b_k of the fresh episodes, and from the earlier ones."""
+        return self._estimate_from(*data.draw(*self.rollouts.batch_sizes, self._rng))
+
+    def _estimate_from(
+        self,
+        batch: EpisodeBatch,
+        hessian_batch: EpisodeBatch | None = None,
+        fisher_batch: EpisodeBatch | None = None,
+    ) -> CurvatureEstimate:
+        return estimate_curvature(
+            self.policy,
+            self.actor,
+            batch,
+            HESSIAN_ESTIMATORS.resolve(self.hessian_estimator, self),
+            hessian_batch=hessian_batch,
+            fisher_batch=fisher_batch,
+            max_steps=self.max_batch_timesteps,
+        )
+
+    def _update_solver(self, batch: EpisodeBatch) -> SubproblemSolver:
+        """Return the solver of this update: what CRPN and ACRPN differ in."""
+        raise NotImplementedError
+
+    def _update_target_kl(self, batch: EpisodeBatch) -> float | None:
+        """Return ``target_kl``, scaled by the spread of the returns unless the user objects."""
+        if self.target_kl is None or not self.scale_target_kl:
+            return self.target_kl
+        unit = RunningMoments(self.get_vec_normalize_env()).reward_unit
+        deviation = unit * math.sqrt(batch.moments(batch.returns)[1])
+        return self.kl_control.scaled_target(self.target_kl, deviation)
+
+    def _fit_critic(self, data: UpdateData) -> float | None:
+        """Regress V on the λ-returns; ``None`` where V is not used.
+
+        Reused rollouts share the minibatches of the fresh one: their number does not grow.
+        """
+        if not self.uses_critic:
+            return None
+        per_pass = math.ceil(data.fresh.total_steps / self.batch_size)
+        return fit_critic(
+            self.policy,
+            self.actor,
+            data.joined,
+            n_minibatches=self.n_critic_updates * per_pass,
+            batch_size=self.batch_size,
+            rng=self._rng,
+        )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
@@ -59,30 +57,11 @@ class RankZeroCallback(CallbackList):
         super().__init__([callback])
         self.model = callback.model
 
-    def on_training_start(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
-        """Call back, as the following methods do."""
-        with local_mode():
-            super().on_training_start(locals_, globals_)
-
-    def on_rollout_start(self) -> None:
-        """Call back."""
-        with local_mode():
-            super().on_rollout_start()
-
-    def on_step(self) -> bool:
-        """Call back."""
-        with local_mode():
-            return super().on_step()
-
-    def on_rollout_end(self) -> None:
-        """Call back."""
-        with local_mode():
-            super().on_rollout_end()
-
-    def on_training_end(self) -> None:
-        """Call back."""
-        with local_mode():
-            super().on_training_end()
+    on_training_start = local_mode()(CallbackList.on_training_start)
+    on_rollout_start = local_mode()(CallbackList.on_rollout_start)
+    on_step = local_mode()(CallbackList.on_step)
+    on_rollout_end = local_mode()(CallbackList.on_rollout_end)
+    on_training_end = local_mode()(CallbackList.on_training_end)
 
 
 class SharedMoments:

@@ -4,151 +4,142 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import Any
+from collections.abc import Iterator
+from contextlib import contextmanager
+from copy import copy
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_crpn.algorithm.distributed_training import DistributedTraining
-from sb3_crpn.algorithm.settings import PolicyNewtonSettings
+from sb3_crpn.algorithm.settings import checked_schedule
 from sb3_crpn.arrays import IntArray
+from sb3_crpn.checks import real
 from sb3_crpn.distributed import local_count, world_size
 from sb3_crpn.episodes import (
     Collector,
     EpisodeRolloutBuffer,
     RolloutSize,
     TickingTracker,
-    Tracker,
     Transition,
     steps_to_quota,
 )
+from sb3_crpn.episodes.running_moments import frozen_moments
 from sb3_crpn.progress import progress
+
+if TYPE_CHECKING:
+    from sb3_crpn.algorithm.algorithm import PolicyNewtonAlgorithm
 
 # An environment without a known time limit counts as endless once an episode outlasts the budget
 # of ``learn``, but not before so many steps
 MIN_EPISODE_LIMIT = 1000
 
 
-class RolloutAlgorithm(OnPolicyAlgorithm, PolicyNewtonSettings):
-    """An on-policy algorithm that learns from the segments of a tracker (DESIGN section 2)."""
+@dataclass
+class TrainingRollouts:
+    """Collects the rollouts that a model learns from, and knows where its environments stand.
 
-    tracker: Tracker
-    ranks: DistributedTraining
-    _mean_episode_length: float | None = None  # of the last rollout
-    _collecting = False
-    _interrupted = False  # where the environments stand is unknown
-    _batch_sizes: tuple[int | None, int | None] = (None, None)
-    _used_fraction = 1.0
-    _mean_reward = 0.0  # of the last rollout, in the environment's own units
-    _trajectory_times: IntArray | None = None  # where the training environments stand
+    Attributes
+    ----------
+    mean_episode_length
+        Of the last rollout; ``None`` before the first.
+    batch_sizes
+        m_k and b_k of the last rollout, ``None`` where they follow from ``n_steps``.
+    used_fraction
+        The part of the last rollout's timesteps that is learnt from.
+    mean_reward
+        Of the last rollout's steps, in the environment's own units.
+    trajectory_times
+        The time of each training environment's next step in its trajectory, [n_envs].
+    interrupted
+        Whether it is not known where the training environments stand.
+    """
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Let a copy that is made in mid-rollout be in none: its environments are reset first."""
-        in_rollout = {"_collecting": False, "_interrupted": True} if self._collecting else {}
-        return vars(self) | in_rollout
+    mean_episode_length: float | None = None
+    batch_sizes: tuple[int | None, int | None] = (None, None)
+    used_fraction: float = 1.0
+    mean_reward: float = 0.0
+    trajectory_times: IntArray | None = None
+    interrupted: bool = False
 
-    def _scheduled_episodes(self) -> tuple[int | None, int | None]:
-        """Return m_k and b_k of this update, ``None`` where they follow from ``n_steps``."""
-        raise NotImplementedError
-
-    @property
-    def uses_critic(self) -> bool:
-        """Whether V enters the advantages at all."""
-        return (
-            self.baseline
-            or self.bootstrap_truncated
-            or self.gae_lambda < 1.0
-            or self.n_reused_rollouts > 0
-            or not self.tracker.whole_episodes
-        )
-
-    def collect_rollouts(
+    def collect(
         self,
+        model: PolicyNewtonAlgorithm,
         env: VecEnv,
         callback: BaseCallback,
-        rollout_buffer: RolloutBuffer,
-        n_rollout_steps: int,
+        buffer: EpisodeRolloutBuffer,
+        n_steps: int,
     ) -> bool:
-        """Fill the buffer with what the tracker keeps of the current policy's trajectories.
+        """Fill the buffer with max(m_k, b_k) episodes, or with ``n_steps`` steps an environment.
 
-        With whole episodes max(m_k, b_k) are simulated; where neither is given, ``n_rollout_steps``
-        steps per environment, in whole episodes at their last mean length. At first no length is
-        known: one episode of each environment tells it, and is thrown away if more were to be run.
-
-        Returns
-        -------
-        bool
-            False if a callback asked to stop.
-
-        Raises
-        ------
-        ValueError
-            A reward or an observation is not finite, or no episode comes to an end.
+        Whole episodes are run at their last mean length. At first no length is known: one episode
+        of each environment tells it, and is thrown away if more were to be run.
         """
-        assert isinstance(rollout_buffer, EpisodeRolloutBuffer)  # set by _setup_model
-        self._batch_sizes = self._scheduled_episodes()
+        self.batch_sizes = _scheduled_sizes(model)
         callback.on_rollout_start()
-        lengths_unknown = self.tracker.whole_episodes and self._mean_episode_length is None
-        n_episodes = self._n_episodes(n_rollout_steps, env.num_envs)
-        completed = self._collect_shares(env, callback, rollout_buffer, n_episodes)
+        lengths_unknown = model.tracker.whole_episodes and self.mean_episode_length is None
+        n_episodes = self._n_episodes(n_steps, env.num_envs)
+        size = RolloutSize(n_steps, n_episodes, model.horizon)
+        completed = self._collect_shares(model, env, callback, buffer, size)
         if completed and lengths_unknown:
-            n_wanted = self._n_episodes(n_rollout_steps, env.num_envs)
+            n_wanted = self._n_episodes(n_steps, env.num_envs)
             if n_wanted > n_episodes:
-                completed = self._collect_shares(env, callback, rollout_buffer, n_wanted)
+                size = replace(size, n_episodes=n_wanted)
+                completed = self._collect_shares(model, env, callback, buffer, size)
         if completed:
             callback.on_rollout_end()
         return completed
 
     def _n_episodes(self, n_steps: int, n_envs: int) -> int:
         """Return how many episodes all ranks simulate, as far as episode lengths are known."""
-        given = [number for number in self._batch_sizes if number is not None]
-        if self._batch_sizes[0] is None:
-            quota = steps_to_quota(n_steps, self._mean_episode_length)
+        given = [number for number in self.batch_sizes if number is not None]
+        if self.batch_sizes[0] is None:
+            quota = steps_to_quota(n_steps, self.mean_episode_length)
             given.append(quota * n_envs * world_size())
         return max(given)
 
     def _collect_shares(
         self,
+        model: PolicyNewtonAlgorithm,
         env: VecEnv,
         callback: BaseCallback,
-        rollout_buffer: EpisodeRolloutBuffer,
-        n_episodes: int,
+        buffer: EpisodeRolloutBuffer,
+        size: RolloutSize,
     ) -> bool:
         """Simulate this rank's share of the rollout; only afterwards ranks add up timesteps."""
-        before = self.num_timesteps
-        size = RolloutSize(self.n_steps, local_count(n_episodes), self.horizon)
-        completed = self._collect_training_rollout(env, callback, rollout_buffer, size)
-        lengths = rollout_buffer.lengths
-        simulated = self.num_timesteps - before
-        stopped, n_simulated, n_segments, n_steps, rewards = self.ranks.totals(
-            not completed, simulated, len(lengths), lengths.sum(), self._mean_reward * simulated
+        before = model.num_timesteps
+        completed = self._simulate(model, env, callback, buffer, _share(size))
+        lengths = buffer.lengths
+        simulated = model.num_timesteps - before
+        stopped, n_simulated, n_segments, n_steps, rewards = model.ranks.totals(
+            not completed, simulated, len(lengths), lengths.sum(), self.mean_reward * simulated
         )
-        self.num_timesteps = before + int(n_simulated)
+        model.num_timesteps = before + int(n_simulated)
         if stopped:
             return False
-        self._mean_episode_length = n_steps / n_segments
-        self._used_fraction = n_steps / n_simulated
-        self._mean_reward = rewards / n_simulated
+        self.mean_episode_length = n_steps / n_segments
+        self.used_fraction = n_steps / n_simulated
+        self.mean_reward = rewards / n_simulated
         return True
 
-    def _collect_training_rollout(
+    def _simulate(
         self,
+        model: PolicyNewtonAlgorithm,
         env: VecEnv,
         callback: BaseCallback,
         buffer: EpisodeRolloutBuffer,
         size: RolloutSize,
     ) -> bool:
         """Run the environments, counting timesteps and calling back as SB3 does."""
-        collector = self._collector(env)
-        collector.timestep = self.num_timesteps
-        if size.horizon is None and _time_limit(env) is None:
-            budget = math.ceil((self._total_timesteps - self.num_timesteps) / env.num_envs)
+        collector = self._collector(model, env)
+        collector.timestep = model.num_timesteps
+        if size.horizon is None and not _has_time_limit(env):
+            budget = math.ceil((model._total_timesteps - model.num_timesteps) / env.num_envs)
             collector.expect_an_end_within(max(budget, 2 * size.n_steps, MIN_EPISODE_LIMIT))
         names = {
-            "self": self,
+            "self": model,
             "env": env,
             "callback": callback,
             "rollout_buffer": buffer,
@@ -156,141 +147,139 @@ class RolloutAlgorithm(OnPolicyAlgorithm, PolicyNewtonSettings):
         }
 
         def on_step(transition: Transition) -> bool:
-            self.num_timesteps += env.num_envs
+            model.num_timesteps += env.num_envs
             callback.update_locals(names | vars(transition))
             if not callback.on_step():
                 return False
-            self._update_info_buffer(transition.infos, transition.dones)
+            model._update_info_buffer(transition.infos, transition.dones)
             return True
 
-        with _Rollout(self, env):
+        with self._occupying(model, env):
             try:
-                completed = collector.collect(buffer, self.tracker, size, on_step)
+                completed = collector.collect(buffer, model.tracker, size, on_step)
             finally:
-                self.num_timesteps = collector.timestep
-                if env is self.env:  # a callback may have set another
-                    self._leave(collector)
-            self._interrupted = not completed
-            self._mean_reward = collector.mean_reward
+                model.num_timesteps = collector.timestep
+                if env is model.env:  # a callback may have set another
+                    self._leave(model, collector)
+        self.interrupted = not completed
+        self.mean_reward = collector.mean_reward
         return completed
 
-    def _collector(self, env: VecEnv) -> Collector:
+    def evaluate(
+        self,
+        model: PolicyNewtonAlgorithm,
+        n_episodes: int,
+        env: VecEnv | None,
+        *,
+        show: bool = False,
+    ) -> EpisodeRolloutBuffer:
+        """Simulate whole episodes outside training: no callbacks, no timesteps counted.
+
+        ``env=None`` is the training environment, which the next rollout finds as if a rollout of
+        its own had come before. ``show``: with a progress bar.
+        """
+        target = model.env if env is None else env
+        if target is None:
+            raise ValueError("env=None is not allowed for a model without an environment")
+        buffer = copy(model.rollout_buffer)
+        assert isinstance(buffer, EpisodeRolloutBuffer)  # by the checks of arguments
+        buffer.n_envs = target.num_envs
+        size = _share(RolloutSize(model.n_steps, n_episodes, model.horizon))
+        bar = progress("episodes", size.n_episodes, show=show)
+        with bar as tick, self._occupying(model, target):
+            with frozen_moments(target):
+                collector = self._collector(model, target)
+                collector.collect(buffer, TickingTracker(tick), size)
+            if target is model.env:
+                self._leave(model, collector)
+                self.interrupted = False
+        return buffer
+
+    @contextmanager
+    def _occupying(self, model: PolicyNewtonAlgorithm, env: VecEnv) -> Iterator[None]:
+        """Mark the time of a rollout: the training environment serves one at a time."""
+        is_training_env = env is model.env
+        if model._collecting and is_training_env:
+            raise RuntimeError(
+                "the training environment is in the middle of a rollout: "
+                "pass an environment of its own with env="
+            )
+        outer, model._collecting = model._collecting, True
+        try:
+            yield
+        except BaseException:
+            self.interrupted |= is_training_env
+            raise
+        finally:
+            model._collecting = outer
+
+    def _collector(self, model: PolicyNewtonAlgorithm, env: VecEnv) -> Collector:
         """Return a collector that goes on where the training environments stand."""
-        self.policy.set_training_mode(False)
+        model.policy.set_training_mode(False)
         collector = Collector(
-            self.policy,
+            model.policy,
             env,
-            bootstrap_truncated=self.bootstrap_truncated,
-            uses_critic=self.uses_critic,
-            sde_sample_freq=self.sde_sample_freq,
+            bootstrap_truncated=model.bootstrap_truncated,
+            uses_critic=model.uses_critic,
+            sde_sample_freq=model.sde_sample_freq,
         )
-        if env is self.env and self._last_obs is not None:
-            collector.stand(self._last_obs, self._times(env.num_envs))
-            if self._interrupted and collector.can_reset:
+        if env is model.env and model._last_obs is not None:
+            collector.stand(model._last_obs, self._times(model))
+            if self.interrupted and collector.can_reset:
                 collector.reset()
         else:
             collector.reset()
         return collector
 
-    def _times(self, n_envs: int) -> IntArray:
+    def _times(self, model: PolicyNewtonAlgorithm) -> IntArray:
         """Return the time of each training environment's next step in its trajectory, [n_envs].
 
         Where it is not known, none stands at the start of an episode.
         """
-        times = self._trajectory_times
-        if times is None or len(times) != n_envs:
-            times = np.ones(n_envs, dtype=np.int64)
-        starts = np.asarray(self._last_episode_starts).astype(np.bool_)
-        return np.maximum(times, 1) if self._interrupted else np.where(starts, 0, times)
+        starts = np.asarray(model._last_episode_starts).astype(np.bool_)
+        times = self.trajectory_times
+        if times is None or len(times) != len(starts):
+            times = np.ones(len(starts), dtype=np.int64)
+        return np.maximum(times, 1) if self.interrupted else np.where(starts, 0, times)
 
-    def _leave(self, collector: Collector) -> None:
+    def _leave(self, model: PolicyNewtonAlgorithm, collector: Collector) -> None:
         """Remember where the training environments stand."""
-        self._last_obs = collector.observations
-        self._last_episode_starts = collector.at_episode_start
-        self._trajectory_times = collector.times
+        model._last_obs = collector.observations
+        model._last_episode_starts = collector.at_episode_start
+        self.trajectory_times = collector.times
 
-    def _collect_evaluation_episodes(
-        self, n_episodes: int, env: VecEnv | None, show: bool
-    ) -> EpisodeRolloutBuffer:
-        """Simulate whole episodes outside training: no callbacks, no timesteps counted.
-
-        ``env=None`` is the training environment, which the next rollout finds as if a rollout of
-        its own had come before.
-        """
-        target = self.env if env is None else env
-        if target is None:
-            raise ValueError("env=None is not allowed for a model without an environment")
-        buffer = self._new_buffer(target.num_envs)
-        normalizer = unwrap_vec_normalize(target)
-        learns = normalizer is not None and normalizer.training
-        size = RolloutSize(self.n_steps, local_count(n_episodes), self.horizon)
-        with progress("episodes", size.n_episodes, show=show) as tick, _Rollout(self, target):
-            try:
-                if normalizer is not None:
-                    normalizer.training = False
-                collector = self._collector(target)
-                collector.collect(buffer, TickingTracker(tick), size)
-            finally:
-                if normalizer is not None:
-                    normalizer.training = learns
-            if target is self.env:
-                self._leave(collector)
-                self._interrupted = False
-        return buffer
-
-    def _new_buffer(self, n_envs: int) -> EpisodeRolloutBuffer:
-        assert self.rollout_buffer_class is not None  # by _setup_model
-        buffer = self.rollout_buffer_class(
-            self.n_steps,
-            self.observation_space,
-            self.action_space,
-            device=self.device,
-            gamma=self.gamma,
-            gae_lambda=self.gae_lambda,
-            n_envs=n_envs,
-            **self.rollout_buffer_kwargs,
-        )
-        assert isinstance(buffer, EpisodeRolloutBuffer)  # by the checks of arguments
-        return buffer
+    def adopt(self, attributes: dict[str, Any]) -> None:
+        """Take over what older files hold as attributes of the model, which they lose."""
+        for field in fields(self):
+            if (name := f"_{field.name}") in attributes:
+                setattr(self, field.name, attributes.pop(name))
 
 
-class _Rollout:
-    """Marks the time of a rollout: the training environment serves one at a time."""
-
-    def __init__(self, model: RolloutAlgorithm, env: VecEnv) -> None:
-        if model._collecting and env is model.env:
-            raise RuntimeError(
-                "the training environment is in the middle of a rollout: "
-                "pass an environment of its own with env="
-            )
-        self._model, self._outer, self._is_training_env = model, model._collecting, env is model.env
-
-    def __enter__(self) -> None:
-        self._model._collecting = True
-
-    def __exit__(self, kind: type[BaseException] | None, *rest: Any) -> None:
-        self._model._collecting = self._outer
-        if kind is not None and self._is_training_env:
-            self._model._interrupted = True
+def _share(size: RolloutSize) -> RolloutSize:
+    """Return this rank's share of a rollout; timesteps are each rank's own."""
+    return replace(size, n_episodes=local_count(size.n_episodes))
 
 
-def _time_limit(env: VecEnv) -> int | None:
-    """Return the largest time limit of the environments' specs, ``None`` where one has none."""
-    try:
-        limits = [getattr(spec, "max_episode_steps", None) for spec in env.get_attr("spec")]
-    except (AttributeError, NotImplementedError):
-        return None
-    known = [limit for limit in limits if limit is not None]
-    return max(known) if len(known) == len(limits) else None
+def _scheduled_sizes(model: PolicyNewtonAlgorithm) -> tuple[int | None, int | None]:
+    """Return m_k and b_k at the present progress, ``None`` where they follow from ``n_steps``."""
+
+    def number(name: str) -> int | None:
+        if getattr(model, name) is None:
+            return None
+        return round(checked_schedule(model, name, real(1.0))(model._current_progress_remaining))
+
+    return number("n_episodes"), number("n_hessian_episodes")
+
+
+def _has_time_limit(env: VecEnv) -> bool:
+    """Whether the specs of all environments are known, and have a time limit."""
+    specs = _specs(env)
+    return bool(specs) and all(getattr(spec, "max_episode_steps", None) for spec in specs)
 
 
 def warn_of_endless_episodes(env: VecEnv) -> None:
     """Warn where an environment is registered without a time limit and may thus never end."""
-    try:
-        specs = env.get_attr("spec")
-    except (AttributeError, NotImplementedError):
-        return
-    for spec in specs:
+    for spec in _specs(env):
         if spec is not None and spec.max_episode_steps is None:
             warnings.warn(
                 f"{spec.id} has no time limit, and whole episodes are learnt from: if its episodes "
@@ -298,3 +287,11 @@ def warn_of_endless_episodes(env: VecEnv) -> None:
                 stacklevel=4,
             )
             return
+
+
+def _specs(env: VecEnv) -> list[Any]:
+    """Return the environments' specs, none where a vectorised environment does not tell."""
+    try:
+        return env.get_attr("spec")
+    except (AttributeError, NotImplementedError):
+        return []

@@ -69,7 +69,7 @@ _POLICY = requires(
     '"MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a feed-forward subclass of ActorCriticPolicy',
     _is_policy,
 )
-_ENV = requires("an environment or a registered id", lambda value: True)
+_ENV = requires("an environment or a registered id", lambda value: value is not None)
 _TRACKER = requires(
     '"episodes", "timesteps" or a class of Tracker',
     lambda value: value in TRACKERS if isinstance(value, str) else callable(value),
@@ -102,6 +102,11 @@ class CheckedSchedule:
         value = self.value(progress) if callable(self.value) else self.value
         checked: float = self.check(f"{self.name}({progress:g})", value)
         return checked
+
+
+def checked_schedule(model: object, name: str, check: Check) -> CheckedSchedule:
+    """Return the argument ``name`` of ``model`` as a schedule."""
+    return CheckedSchedule(f"{type(model).__name__}: {name}", getattr(model, name), check)
 
 
 @dataclass(init=False, eq=False, repr=False)

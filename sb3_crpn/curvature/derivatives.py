@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 
-import numpy as np
 import torch
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_crpn.arrays import FloatArray
 from sb3_crpn.curvature.pair_weights import HessianEstimator
 from sb3_crpn.episodes.batch import EpisodeBatch
 from sb3_crpn.parameters import ActorParameters
@@ -95,7 +93,9 @@ class EpisodeDerivatives:
         Σ A_i σ_i·v is linear in A, one backward pass gives both u and the second term.
         """
         u, curvature = self._along(vector)
-        w = self._pair_product(u.to("cpu", torch.float64).numpy())
+        w = self._estimator.apply(
+            self.batch.cost_advantages, self.batch.lengths, u.to("cpu", torch.float64).numpy()
+        )
         outer = torch.autograd.grad(
             self._log_prob,
             self._actor.tensors,
@@ -116,20 +116,8 @@ class EpisodeDerivatives:
             for columns in zip(*(self._along(vector) for vector in basis.T), strict=True)
         )
         U = u.to("cpu", torch.float64).numpy()
-        outer = U.T @ self._pair_product(U)
+        outer = U.T @ self._estimator.apply(self.batch.cost_advantages, self.batch.lengths, U)
         return (torch.from_numpy(outer).to(basis) + basis.T @ curvature) / self.batch.size
-
-    def _pair_product(self, u: FloatArray) -> FloatArray:
-        """Return Wu for u [T] or [T, k]; an earlier policy's pair i ≠ j has the weight ρ_i ρ_j.
-
-        A_i holds ρ_i already. A step is no pair with itself: W_ii = A_i.
-        """
-        shape = (-1, *[1] * (u.ndim - 1))
-        A, ratios = self.batch.cost_advantages, self.batch.ratios
-        unweighted = np.divide(A, ratios, out=np.zeros_like(A), where=ratios > 0.0)
-        column = ratios.reshape(shape)
-        pairs = column * self._estimator.apply(unweighted, self.batch.lengths, column * u)
-        return pairs - ((ratios - 1.0) * A).reshape(shape) * u
 
     def _along(self, vector: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return u = Jv, [T], and ∇(Σ_i A_i σ_i·v), [d], by one backward pass."""

@@ -27,9 +27,6 @@ N_GROUPS = 2
 # waits for its kernels to be launched, and gets one graph a group.
 CPU_CHUNK_STEPS = 4096
 
-# VᵀBV of more columns is made from products, whose memory does not grow with columns × timesteps
-MAX_FORM_COLUMNS = 128
-
 
 class EpisodeFolds:
     """The trajectories of all ranks, split round-robin into K folds; this rank holds a part.

@@ -29,21 +29,18 @@ class Registry(dict[str, Callable[[Any], T]], Generic[T]):
         super().__init__(factories)
         self._protocol = protocol
 
-    def accepts(self, value: object) -> bool:
-        """Whether ``value`` is a registered name or an object of the protocol."""
-        if isinstance(value, str):
-            return value in self
-        return isinstance(value, self._protocol) and not isinstance(value, type)
-
     @property
     def check(self) -> Check:
         """The check of an argument: a registered name, or an object of the protocol."""
-        return requires(self.allowed, self.accepts)
-
-    @property
-    def allowed(self) -> str:
-        """What :meth:`check` accepts, in words."""
-        return f"one of {', '.join(map(repr, self))} or an object of {self._protocol.__name__}"
+        allowed = f"one of {', '.join(map(repr, self))} or an object of {self._protocol.__name__}"
+        return requires(
+            allowed,
+            lambda value: (
+                value in self
+                if isinstance(value, str)
+                else isinstance(value, self._protocol) and not isinstance(value, type)
+            ),
+        )
 
     def resolve(self, value: T | str, algorithm: object) -> T:
         """Return the object that ``value`` is, or is the name of."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -21,6 +21,8 @@ from sb3_crpn.distributed import (
     world_size,
 )
 from sb3_crpn.episodes.observations import map_observations
+
+moments = mean_and_variance  # of what is no batch yet, over all ranks
 
 
 def episode_starts(lengths: IntArray) -> IntArray:
@@ -81,11 +83,6 @@ def round_robin_split(trajectories: IntArray, n_folds: int, first: int = 0) -> l
     order[np.argsort(first_seen)] = np.arange(len(first_seen))
     fold = (order[index] + first) % n_folds
     return [np.flatnonzero(fold == k) for k in range(n_folds)]
-
-
-def moments(values: FloatArray) -> tuple[float, float]:
-    """Return mean and variance of the union of the ranks' arrays, [n]."""
-    return mean_and_variance(values)
 
 
 @np.errstate(under="ignore")  # powers of a factor: what underflows is 0
@@ -151,8 +148,6 @@ class EpisodeBatch:
         r_i, [T].
     log_probs
         log π(a_i|s_i) of the policy that acted, [T].
-    ratios
-        min(ρ̄, ρ_i), the importance ratio that A_i holds already, [T]; 1 in a fresh rollout.
     terminal_values
         V of the state after each segment's last step, [E]: 0 where it is not bootstrapped.
     times
@@ -171,7 +166,6 @@ class EpisodeBatch:
     returns: FloatArray
     rewards: FloatArray
     log_probs: FloatArray
-    ratios: FloatArray
     terminal_values: FloatArray
     times: IntArray
     trajectories: IntArray
@@ -241,7 +235,7 @@ class EpisodeBatch:
 
     def moments(self, values: FloatArray) -> tuple[float, float]:
         """Return mean and variance over the steps of all ranks of ``values``, [T]."""
-        return moments(values)
+        return mean_and_variance(values)
 
     def take(self, episodes: IntArray) -> EpisodeBatch:
         """Return the batch of the chosen episodes, in the order given."""
@@ -267,21 +261,14 @@ class EpisodeBatch:
         ]
 
     def _select(self, episodes: slice | IntArray, steps: slice | IntArray) -> EpisodeBatch:
-        return EpisodeBatch(
-            observations=map_observations(self.observations, lambda tensor: tensor[steps]),
-            actions=self.actions[steps],
-            lengths=self.lengths[episodes],
-            cost_advantages=self.cost_advantages[steps],
-            values=self.values[steps],
-            returns=self.returns[steps],
-            rewards=self.rewards[steps],
-            log_probs=self.log_probs[steps],
-            ratios=self.ratios[steps],
-            terminal_values=self.terminal_values[episodes],
-            times=self.times[episodes],
-            trajectories=self.trajectories[episodes],
-            unit=self.unit,
-        )
+        of_episodes = ("lengths", "terminal_values", "times", "trajectories")
+        chosen: dict[str, Any] = {
+            field.name: getattr(self, field.name)[episodes if field.name in of_episodes else steps]
+            for field in fields(self)
+            if field.name not in ("observations", "unit")
+        }
+        observations = map_observations(self.observations, lambda tensor: tensor[steps])
+        return replace(self, observations=observations, **chosen)
 
 
 def concatenate(batches: Sequence[EpisodeBatch]) -> EpisodeBatch:

@@ -94,11 +94,6 @@ class EpisodeRolloutBuffer(RolloutBuffer):
         """Steps of each segment, [E]."""
         return self._of_segments("length")
 
-    @property
-    def used_fraction(self) -> float:
-        """Share of the collected steps that belong to segments, in the rollout of this process."""
-        return float(self.lengths.sum() / (self.pos * self.n_envs))
-
     def _of_segments(self, name: str) -> IntArray:
         return np.array([getattr(segment, name) for segment in self._segments], dtype=np.int64)
 
@@ -186,7 +181,6 @@ class EpisodeRolloutBuffer(RolloutBuffer):
             returns=returns,
             rewards=self.rewards[valid].astype(np.float64),
             log_probs=self.log_probs[valid].astype(np.float64),
-            ratios=np.ones(len(values)),
             terminal_values=self._terminal_values,
             times=times,
             trajectories=self._of_segments("trajectory") * self.n_envs + self._of_segments("env"),

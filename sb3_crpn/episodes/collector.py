@@ -90,7 +90,7 @@ class Collector:
         self._sde_sample_freq = sde_sample_freq
         self.can_reset = _early_resets_allowed(env)
         normalizer = unwrap_vec_normalize(env)
-        self._moments = None if normalizer is None else RunningMoments(normalizer)
+        self._moments = RunningMoments(normalizer)
         self._raw_rewards = _raw_rewards(normalizer)
         self._start_time = time.time()
 
@@ -101,16 +101,13 @@ class Collector:
         return starts
 
     def stand(self, observations: Any, times: IntArray) -> None:
-        """Say where the environments stand; ``None``: reset them."""
-        if observations is None:
-            self.reset()
-            return
+        """Say where the environments stand."""
         self.observations, self.times = as_arrays(observations), times
         self._require_finite("observation", self.observations)
 
     def reset(self) -> None:
         """Reset all environments."""
-        before = None if self._moments is None else self._moments.snapshot()
+        before = self._moments.snapshot()
         self.observations = as_arrays(self.env.reset())
         self.times = np.zeros(self.env.num_envs, dtype=np.int64)
         self._require_finite("observation", self.observations, before)
@@ -186,7 +183,7 @@ class Collector:
         obs_tensor = to_tensor(self.policy, self.observations)
         actions = sample_actions(self.policy, obs_tensor)
         clipped_actions = environment_actions(self.policy, actions)
-        before = None if self._moments is None else self._moments.snapshot()
+        before = self._moments.snapshot()
         new_obs, rewards, dones, infos = self.env.step(clipped_actions)
         self._n_steps += 1
         self.timestep += self.env.num_envs
@@ -246,7 +243,7 @@ class Collector:
         """Raise when the environment returned NaN or infinity; ``VecNormalize`` forgets it."""
         if all_finite(value):
             return
-        if self._moments is not None and moments is not None:
+        if moments is not None:
             self._moments.restore(moments)
         raise ValueError(
             f"the environment returned a non-finite {what} at timestep {self.timestep}: {value}; "

@@ -35,9 +35,8 @@ class Replay:
     where δ takes the present V, and the critic's target is V(s_i) + c_i Â_i (V-trace; Espeholt et
     al., IMPALA, ICML 2018, with ρ̄ = c̄ = 1 there). For π = μ these are the cost advantages
     of a fresh rollout. That μ visited the states is not corrected, as is usual (Queeney et
-    al., Generalized proximal policy optimization with sample reuse, NeurIPS 2021). In H a pair of
-    steps counts with the ratios of both actions. A rollout is dropped once its effective sample
-    size (Σρ)²/Σρ² falls below half of its steps.
+    al., Generalized proximal policy optimization with sample reuse, NeurIPS 2021). A rollout is
+    dropped once its effective sample size (Σρ)²/Σρ² falls below half of its steps.
 
     Parameters
     ----------
@@ -80,10 +79,9 @@ class Replay:
         ratios: FloatArray,
         *,
         baseline: bool,
-        normalize_advantage: bool,
-        discount_visitation: bool,
+        **weighting: bool,
     ) -> EpisodeBatch:
-        clipped_ratios, truncated = np.minimum(ratios, 1.0), np.minimum(ratios, MAX_RATIO)
+        clipped_ratios = np.minimum(ratios, 1.0)
         advantages = generalized_advantages(
             batch.rewards,
             values,
@@ -98,13 +96,11 @@ class Replay:
             batch.lengths,
             batch.times,
             gamma=self._gamma,
-            normalize_advantage=normalize_advantage,
-            discount_visitation=discount_visitation,
+            **weighting,
         )
         return replace(
             batch,
-            cost_advantages=truncated * costs,
-            ratios=truncated,
+            cost_advantages=np.minimum(ratios, MAX_RATIO) * costs,
             values=values,
             returns=values + clipped_ratios * advantages,
         )

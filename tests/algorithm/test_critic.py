@@ -11,7 +11,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_crpn import CRPN
-from sb3_crpn.algorithm import update
+from sb3_crpn.algorithm import algorithm as base
 from sb3_crpn.algorithm.critic import fit_critic, fuse
 from sb3_crpn.parameters import ActorParameters
 from tests.policies import ACTION_SPACES, OBSERVATION_SPACE, frozen_episodes
@@ -139,9 +139,9 @@ def test_the_update_fits_the_critic_around_a_shared_extractor(monkeypatch):
     shared = model.policy.features_extractor.linear.weight
     assert any(tensor is shared for tensor in model.actor.tensors)
     states = []
-    take, fit_values = update.take_step, model._fit_critic
+    take, fit_values = base.take_step, model._fit_critic
     monkeypatch.setattr(
-        update, "take_step", lambda *a: (take(*a), states.append(model.actor.vector))[0]
+        base, "take_step", lambda *a: (take(*a), states.append(model.actor.vector))[0]
     )
     monkeypatch.setattr(
         model, "_fit_critic", lambda *a: (states.append("critic"), fit_values(*a))[1]
@@ -157,7 +157,7 @@ def test_the_update_fits_the_critic_around_a_shared_extractor(monkeypatch):
 def test_earlier_rollouts_share_in_the_minibatches_of_the_fresh_one(monkeypatch):
     passes = []
     monkeypatch.setattr(
-        update, "fit_critic", lambda *a, **options: passes.append((a[2].n_steps, options)) or 0.0
+        base, "fit_critic", lambda *a, **options: passes.append((a[2].n_steps, options)) or 0.0
     )
     CRPN("MlpPolicy", Noise(), n_episodes=20, n_critic_updates=3, seed=0, device="cpu").learn(300)
     sizes = [n_steps for n_steps, _ in passes]

@@ -39,10 +39,10 @@ def test_policy_objective_is_trpos():
     batches = []
     estimate = model._estimate
 
-    def recorded(*arguments):
-        batch = estimate(*arguments).gradient_batch
+    def recorded(data):
+        batch = estimate(data).gradient_batch
         batches.append((batch, log_prob(batch)))
-        return estimate(*arguments)
+        return estimate(data)
 
     def log_prob(batch):
         distribution = model.policy.get_distribution(batch.observations)
@@ -83,8 +83,8 @@ def test_logged_values_are_those_of_the_rollout_and_its_matrices(monkeypatch):
     estimate, product = model._estimate, EpisodeDerivatives.fisher_product
     seen, products = [], []
 
-    def recorded(*arguments):
-        found = estimate(*arguments)
+    def recorded(data):
+        found = estimate(data)
         seen.append((found.gradient_batch, found.hessian.to_dense(), found.fisher.to_dense()))
         products.clear()
         return found

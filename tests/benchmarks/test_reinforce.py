@@ -11,7 +11,7 @@ def test_the_step_is_the_gradient_times_the_rate():
     log = TrainLog()
     gradients = []
     estimate = model._estimate
-    model._estimate = lambda *batches: gradients.append(estimate(*batches)) or gradients[-1]
+    model._estimate = lambda data: gradients.append(estimate(data)) or gradients[-1]
     model.learn(1, callback=log)
     expected = before - 0.25 * gradients[0].gradient
     torch.testing.assert_close(model.actor.vector, expected, rtol=1e-6, atol=1e-6)

@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -15,9 +13,7 @@ from tests.policies import (
     estimator_of,
     flat_gradient,
     frozen_episodes,
-    log_hessians,
     log_probabilities,
-    pair_matrix,
     scores,
     small_policy,
 )
@@ -56,28 +52,6 @@ def test_products_are_those_of_the_dense_hessian(kind, case):
     V = torch.randn(len(actor), 3, dtype=torch.float64)
     form = group.quadratic_form(V)
     torch.testing.assert_close(form, V.T @ expected @ V, rtol=1e-10, atol=1e-11)
-
-
-@pytest.mark.parametrize("case", ESTIMATORS)
-def test_both_steps_of_a_pair_have_the_ratio_of_their_action(case):
-    """W_ij = ρ_i ρ_j W⁰_ij for i ≠ j and W_ii = ρ_i A⁰_i, W⁰ of the costs A⁰ without ratios."""
-    policy, actor = small_policy("discrete")
-    batch = frozen_episodes(policy)
-    ratios = np.linspace(0.0, 2.0, batch.n_steps)
-    reused = replace(batch, ratios=ratios, cost_advantages=ratios * batch.cost_advantages)
-    derivatives = EpisodeDerivatives(policy, actor, reused, estimator_of(*case))
-    sigma = scores(policy, actor, batch).numpy()
-    pairs = np.zeros((len(actor), len(actor)))
-    for steps in episode_slices(batch):
-        W = pair_matrix(*case, batch.cost_advantages[steps]) * np.outer(*2 * [ratios[steps]])
-        np.fill_diagonal(W, reused.cost_advantages[steps])
-        pairs += sigma[steps].T @ W @ sigma[steps]
-    curvature = log_hessians(policy, actor, batch).numpy()
-    expected = (pairs + np.tensordot(reused.cost_advantages, curvature, 1)) / batch.n_episodes
-    product = columns(derivatives.hessian_product, len(actor)).numpy()
-    np.testing.assert_allclose(product, expected, rtol=1e-10, atol=1e-12)
-    form = derivatives.quadratic_form(torch.eye(len(actor), dtype=torch.float64))
-    np.testing.assert_allclose(form.numpy(), expected, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -77,7 +77,6 @@ def numbered_batch(lengths, *, is_dict=False):
         returns=-steps,
         rewards=2 * steps,
         log_probs=3 * steps,
-        ratios=0.5 * steps,
         terminal_values=np.arange(float(len(lengths))),
         times=np.zeros(len(lengths), dtype=int),
         trajectories=np.arange(len(lengths)),

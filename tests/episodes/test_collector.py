@@ -53,7 +53,7 @@ class Updates(BaseCallback):
     def _on_rollout_end(self):
         self.lengths.append(self.model.rollout_buffer.lengths.tolist())
         self.timesteps.append(self.num_timesteps)
-        self.used.append(self.model._used_fraction)
+        self.used.append(self.model.rollouts.used_fraction)
 
 
 def clock_crpn(*durations, monitor=True, **arguments):
@@ -66,7 +66,7 @@ def clock_crpn(*durations, monitor=True, **arguments):
 
 
 def observed_time_is_episode_time(model):
-    batch = model._episode_batch(model.rollout_buffer)
+    batch = model._batch(model.rollout_buffer)
     expected = episode_time(batch.lengths)
     return np.array_equal(batch.observations.flatten().numpy(), expected)
 

@@ -96,7 +96,7 @@ def clocks(*durations, algorithm=CRPN, early_resets=True, truncates=False, **arg
 
 
 def knows_the_time(model):
-    batch = model._episode_batch(model.rollout_buffer)
+    batch = model._batch(model.rollout_buffer)
     expected = episode_time(batch.lengths, batch.times)
     return np.array_equal(batch.observations.flatten().numpy(), expected)
 
@@ -123,7 +123,7 @@ def test_the_time_is_known_after_a_rollout_that_was_interrupted(early_resets):
     model = clocks(4, np.inf, early_resets=early_resets)
     model.learn(100, While(lambda: model.num_timesteps < 26))
     assert model.num_timesteps == 26
-    assert model._interrupted
+    assert model.rollouts.interrupted
     trained(model)
     assert knows_the_time(model)
     longest = model.rollout_buffer._of_segments("time").max()
@@ -193,7 +193,7 @@ def test_segments_are_bootstrapped_with_the_value_of_the_state_that_follows(
         gae_lambda=0.8,
     )
     trained(model, 2)  # the second rollout begins at times 2 and 5
-    batch = model._episode_batch(model.rollout_buffer)
+    batch = model._batch(model.rollout_buffer)
     with torch.no_grad():
         values = model.policy.predict_values(torch.arange(11.0)[:, None]).flatten().numpy()
     end = values[3] if truncates and bootstrap_truncated else 0.0

@@ -93,7 +93,7 @@ def test_estimates_of_single_episodes_hold(estimator):
     for scale in (0.3, 3.0):
         theta = scale * random_parameters(mdp)
         model.actor.assign(theta)
-        batch = model._episode_batch(model._collect_evaluation_episodes(24, None))
+        batch = model.estimate_curvature(24).gradient_batch
         gradients, hessians = episode_estimates(model.policy, model.actor, batch, estimator)
         theta = model.actor.vector
         assert float(gradients.norm(dim=1).max()) <= constants.G_g
@@ -119,7 +119,6 @@ def test_estimates_of_single_episodes_are_attained():
         returns=np.zeros(H),
         rewards=np.zeros(H),
         log_probs=np.zeros(H),
-        ratios=np.ones(H),
         terminal_values=np.zeros(1),
         times=np.zeros(1, dtype=int),
         trajectories=np.arange(1),

@@ -27,9 +27,9 @@ from benchmarks.experiments.hessians import ConfirmedHessian, FreshHessian, Orac
 from benchmarks.experiments.steps import Subspace, fisher_subspace, parabola_kl, step_of_kl
 from benchmarks.learning.store import RESULTS, read_curves
 from sb3_crpn import CRPN, PAPER
+from sb3_crpn.algorithm.update import UpdateData
 from sb3_crpn.curvature import Causal
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives
-from sb3_crpn.episodes import concatenate
 from sb3_crpn.vec_env import GymnasiumVecEnv
 
 KAPPA = 0.9
@@ -203,7 +203,7 @@ def test_the_oracle_knows_the_hessian_better():
         for _ in range(8):
             batch = model.estimate_curvature(16).gradient_batch
             before = model.num_timesteps
-            estimate = model._estimate(batch, batch, [])
+            estimate = model._estimate(UpdateData(batch, []))
             assert model.num_timesteps == before
             dense = estimate.hessian @ torch.eye(len(THETA)).double() / MDP.horizon
             deviations.append(float((dense - exact).norm()) ** 2)
@@ -214,9 +214,9 @@ def test_the_oracle_knows_the_hessian_better():
 def test_the_fresh_hessian_forgets_earlier_rollouts_and_the_gradient_does_not():
     model = make_learner(FreshHessian)
     batch, earlier = (model.estimate_curvature(6).gradient_batch for _ in range(2))
-    estimate = model._estimate(batch, concatenate([batch, earlier]), [earlier])
+    estimate = model._estimate(UpdateData(batch, [earlier]))
     direction = torch.ones(len(THETA), dtype=torch.float64)
-    alone = model._estimate(batch, batch, [])
+    alone = model._estimate(UpdateData(batch, []))
     assert torch.allclose(estimate.hessian @ direction, alone.hessian @ direction)
     assert not torch.allclose(estimate.gradient, alone.gradient)
 
@@ -225,7 +225,7 @@ def test_a_choice_of_the_hessian_has_the_value_of_its_step():
     space, g, H = exact_model()
     model = make_learner(ConfirmedHessian, n_envs=100, target_kl=0.1)
     batch, earlier = (model.estimate_curvature(4000).gradient_batch for _ in range(2))
-    model._estimate(batch, concatenate([batch, earlier]), [earlier])
+    model._estimate(UpdateData(batch, [earlier]))
     assert len(model.values) == 10
     for (_, omega), value in model.values.items():
         y = step_of_kl(g, omega * H, space, 0.1)
@@ -237,7 +237,7 @@ def test_a_choice_of_the_hessian_has_the_value_of_its_step():
 def test_what_one_episode_says_of_the_hessian_is_not_believed():
     model = make_learner(ConfirmedHessian)
     batch = model.estimate_curvature(1).gradient_batch
-    model._estimate(batch, batch, [])
+    model._estimate(UpdateData(batch, []))
     assert model.choice == ("all", 0.0)
 
 

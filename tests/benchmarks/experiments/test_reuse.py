@@ -42,7 +42,7 @@ def test_derivatives_in_closed_form_are_those_of_the_package(reused):
     model, mdp, theta, episodes = reused
     batch, _ = reuse.reweighted(model, episodes)
     package = EpisodeDerivatives(model.policy, model.actor, batch, Causal(reuse.KAPPA))
-    own = reuse.Derivatives(mdp, theta, batch, reuse.PairRatios(batch.ratios))
+    own = reuse.Derivatives(mdp, theta, batch)
     gradient, hessian = own.gradients.mean(0), own.hessians.mean(0)
     np.testing.assert_allclose(gradient, package.gradient(), rtol=1e-3, atol=1e-4)
     basis = torch.eye(len(theta), dtype=torch.float64)
@@ -61,25 +61,36 @@ def test_fresh_episodes_have_no_bias_and_both_ratios_the_least(reused, monkeypat
     )
 
 
+def test_pairs_have_both_ratios_and_a_step_its_own():
+    A, ratios = np.array([0.5, -1.0, 2.0]), np.array([2.0, 0.5, 1.5])
+    product = reuse.PairRatios(ratios).apply(A, np.array([3]), np.eye(3))
+    expected = np.array(
+        [
+            [reuse.KAPPA ** abs(i - j) * A[max(i, j)] * (ratios[min(i, j)] if i != j else 1.0)
+             for j in range(3)]
+            for i in range(3)
+        ]
+    )  # fmt: skip
+    np.testing.assert_allclose(product, expected)
+
+
 @pytest.mark.parametrize("arm", list(reuse_training.ARMS))
-def test_arms_differ_in_the_ratios_of_reused_steps(reused, arm):
+def test_reused_steps_are_weighted_by_the_ratios_before_them(reused, arm):
     model, _, _, episodes = reused
-    replay = reuse_training.REPLAYS[arm](1, model.gamma, model.gae_lambda)
+    replay = reuse_training.replay_of(model, arm)
     replay.append(episodes)
     (batch,) = replay.reweighted(model.policy, **WEIGHTING)
     expected, ratios = reuse.reweighted(model, episodes)
-    has_both = arm == "both actions"
-    np.testing.assert_array_equal(batch.ratios, expected.ratios if has_both else 1.0)
-    if arm != "visitation":
-        np.testing.assert_array_equal(batch.cost_advantages, expected.cost_advantages)
-        return
+    clip, decay = reuse_training.ARMS[arm]
     start = episode_starts(batch.lengths)[np.argmax(batch.lengths > 1)]
     steps = slice(start, start + 2)
     first, second = batch.cost_advantages[steps] / expected.cost_advantages[steps]
-    assert second / first == pytest.approx(np.exp(0.95 * np.log(ratios[start])))
+    exponent = np.clip(decay * np.log(ratios[start]), -clip, clip)
+    assert second / first == pytest.approx(np.exp(exponent))
+    assert (first == 1.0) == (clip == 0.0)  # weights have a mean of 1
 
 
 def test_a_training_run_is_measured(monkeypatch):
     monkeypatch.setitem(reuse_training.BUDGETS, "CartPole-v1", 800)
-    (row,) = reuse_training.measure("CartPole-v1", 4, "auto", "both actions", 10)
+    (row,) = reuse_training.measure("CartPole-v1", 4, "auto", "c = 1.5, κ = 1", 10)
     assert 15 < row["mean_return"] < 60  # the uniform policy's is 22
