@@ -21,8 +21,8 @@ from sb3_crpn.distributed import local_count, world_size
 from sb3_crpn.episodes import (
     Collector,
     EpisodeRolloutBuffer,
+    ProgressTracker,
     RolloutSize,
-    TickingTracker,
     Transition,
     steps_to_quota,
 )
@@ -189,7 +189,7 @@ class TrainingRollouts:
         with bar as tick, self._occupying(model, target):
             with frozen_moments(target):
                 collector = self._collector(model, target)
-                collector.collect(buffer, TickingTracker(tick), size)
+                collector.collect(buffer, ProgressTracker(tick), size)
             if target is model.env:
                 self._leave(model, collector)
                 self.interrupted = False

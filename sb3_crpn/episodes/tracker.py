@@ -162,7 +162,7 @@ class EpisodeTracker:
         self._recording = self._remaining > 0
 
 
-class TickingTracker(EpisodeTracker):
+class ProgressTracker(EpisodeTracker):
     """Tells a progress bar of each episode that it keeps."""
 
     def __init__(self, tick: Tick) -> None:

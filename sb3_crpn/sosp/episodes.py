@@ -16,8 +16,8 @@ from sb3_crpn.episodes import (
     DictEpisodeRolloutBuffer,
     EpisodeBatch,
     EpisodeRolloutBuffer,
+    ProgressTracker,
     RolloutSize,
-    TickingTracker,
 )
 from sb3_crpn.episodes.batch import discount_factors
 from sb3_crpn.policy import state_values
@@ -92,7 +92,7 @@ def collect_episodes(
     collector.reset()
     buffer = _new_buffer(policy, env.num_envs, gamma)
     size = RolloutSize(n_steps=0, n_episodes=n_episodes, horizon=horizon)
-    collector.collect(buffer, TickingTracker(tick), size)
+    collector.collect(buffer, ProgressTracker(tick), size)
     return buffer.episode_batch(baseline=False, normalize_advantage=False, discount_visitation=True)
 
 

@@ -5,8 +5,8 @@ from hypothesis import strategies as st
 from sb3_crpn.algorithm import rollouts
 from sb3_crpn.episodes import (
     EpisodeTracker,
+    ProgressTracker,
     RolloutSize,
-    TickingTracker,
     episodes_per_env,
     steps_to_quota,
 )
@@ -82,7 +82,7 @@ def test_an_environment_without_quota_is_ignored():
     assert run(tracker, [[1, 1]]) == [(0, 0, 3, False)]
 
 
-class FirstToFinish(TickingTracker):
+class FirstToFinish(ProgressTracker):
     """The biased selection: the first m episodes to finish of all environments."""
 
     def begin(self, size, times):
@@ -118,7 +118,7 @@ def lengths_and_returns(n_repeats=150, n_episodes=12):
 
 def test_kept_episodes_are_not_biased_towards_short_ones(monkeypatch):
     assert not differs(*lengths_and_returns())
-    monkeypatch.setattr(rollouts, "TickingTracker", FirstToFinish)
+    monkeypatch.setattr(rollouts, "ProgressTracker", FirstToFinish)
     means, exact = lengths_and_returns()
     assert differs(means, exact)
     assert np.mean(means, axis=0)[0] < 0.9 * exact[0]
