@@ -328,7 +328,7 @@ def test_critic_leaves_what_it_shares_with_the_actor(algorithm, batch_norm, monk
             shared = torch.nn.Sequential(torch.nn.Linear(2, 8), norm)
             self.mlp_extractor.policy_net = self.mlp_extractor.value_net = shared
 
-    model = make(algorithm, policy=Features, n_critic_updates=5)
+    model = make(algorithm, policy=Features, net_arch=(8,), n_critic_updates=5)
     monkeypatch.setattr(
         algorithm, "_update_solver", replaced(algorithm, lambda step: step * np.nan)
     )

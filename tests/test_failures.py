@@ -280,7 +280,9 @@ def test_a_single_episode(algorithm):
 )
 def test_derivatives_that_overflow(algorithm, settings, log_std, what):
     """An error of the linear algebra, which no tuner handles, is caught too."""
-    model = make(algorithm, Drift(dim=1), policy_kwargs={"log_std_init": log_std}, **settings)
+    model = make(
+        algorithm, Drift(dim=1), net_arch=(8,), policy_kwargs={"log_std_init": log_std}, **settings
+    )
     before = tensors(model)
     with pytest.raises(ValueError, match=f"{what} is not finite.* raise alpha, or set target_kl"):
         model.learn(60)

@@ -141,7 +141,7 @@ class Valid(Drift):
 
 @both
 def test_a_policy_that_is_not_finite_at_zeros(algorithm):
-    model = make(algorithm, Valid(), policy=Masked)
+    model = make(algorithm, Valid(), policy=Masked, net_arch=(8,))
     theta = model.actor.vector
     assert len(theta) == 8 * 3 + 9 * 2
     assert torch.distributions.Distribution._validate_args

@@ -170,13 +170,15 @@ def break_hard_case_length(monkeypatch):
 
 def break_clamp(monkeypatch):
     """Forget that λ ≥ -λ_1."""
-    root = secular._root
-    monkeypatch.setattr(secular, "_root", lambda a, w, shift: (root(a, w, shift)[0] - shift / 2, 0))
+    root = secular._secular_root
+    monkeypatch.setattr(
+        secular, "_secular_root", lambda a, w, shift: (root(a, w, shift)[0] - shift / 2, 0)
+    )
 
 
 def break_iteration(monkeypatch):
     """Take the starting lower bound for the root."""
-    monkeypatch.setattr(secular, "_root", lambda *a: (secular._lower_bound(*a), 0))
+    monkeypatch.setattr(secular, "_secular_root", lambda *a: (secular._lower_bound(*a), 0))
 
 
 def break_exponent(monkeypatch):
