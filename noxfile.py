@@ -36,7 +36,8 @@ def tests(session: nox.Session, resolution: str) -> None:
     """Install the package and run a selection of its tests."""
     pyproject = nox.project.load_toml("pyproject.toml")
     group = nox.project.dependency_groups(pyproject, "test")
-    session.install("--resolution", resolution, f".[{EXTRAS}]", *group)
+    # editable: rl-zoo's scripts then read the tree's hyperparameters, as a test expects
+    session.install("--resolution", resolution, "--editable", f".[{EXTRAS}]", *group)
     # deprecations depend on the versions, and are errors in the suite's own environment alone
     options = ["-o", "filterwarnings=default", *(session.posargs or SELECTION)]
     session.run("pytest", *options, env={"OMP_NUM_THREADS": "1"})

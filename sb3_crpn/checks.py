@@ -35,13 +35,17 @@ class Check:
     Attributes
     ----------
     allowed
-        What the rule allows, for people.
+        What the rule allows, for people; a function where that grows with a registry.
     convert
         Returns the value as a plain Python object, or raises ``_RefusedError``.
     """
 
-    allowed: str
+    allowed: str | Callable[[], str]
     convert: Callable[[Any], Any]
+
+    def __str__(self) -> str:
+        """Return what the rule allows."""
+        return self.allowed if isinstance(self.allowed, str) else self.allowed()
 
     def __call__(self, name: str, value: object) -> Any:
         """Return the converted value.
@@ -56,7 +60,7 @@ class Check:
         try:
             return self.convert(_plain(value))
         except _RefusedError:
-            raise not_allowed(name, value, self.allowed) from None
+            raise not_allowed(name, value, str(self)) from None
 
     def __or__(self, other: Check) -> Check:
         def convert(value: Any) -> Any:
@@ -65,7 +69,7 @@ class Check:
             except _RefusedError:
                 return other.convert(value)
 
-        return Check(f"{self.allowed} or {other.allowed}", convert)
+        return Check(lambda: f"{self} or {other}", convert)
 
 
 def _plain(value: Any) -> Any:
@@ -73,7 +77,7 @@ def _plain(value: Any) -> Any:
     return value.item() if getattr(value, "ndim", None) == 0 and hasattr(value, "item") else value
 
 
-def requires(allowed: str, condition: Callable[[Any], object]) -> Check:
+def requires(allowed: str | Callable[[], str], condition: Callable[[Any], object]) -> Check:
     """Return the check that lets values pass as they are if they meet ``condition``."""
 
     def convert(value: Any) -> Any:
@@ -140,7 +144,7 @@ def pair(check: Check) -> Check:
             raise _RefusedError from None
         return check.convert(_plain(first)), check.convert(_plain(second))
 
-    return Check(f"two of {check.allowed}", convert)
+    return Check(lambda: f"two of {check}", convert)
 
 
 POSITIVE = real(0.0, open_low=True)

@@ -10,6 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_crpn import CRPN
+from sb3_crpn.algorithm import rollouts
 from tests.envs import Drift, Rewards
 from tests.training import make, several
 
@@ -101,6 +102,16 @@ def test_endless_episodes_end_with_the_budget():
         pytest.raises(ValueError, match=r"within 1500 steps.*horizon=H.*TimeLimit.*timesteps"),
     ):
         make(CRPN, endless).learn(3000)
+
+
+def test_an_estimate_of_endless_episodes_ends(monkeypatch):
+    monkeypatch.setattr(rollouts, "EVALUATION_EPISODE_LIMIT", 100)
+    model = make(CRPN, several(2, bound=np.inf, limit=np.inf), rollout="timesteps")
+    with (
+        pytest.warns(UserWarning, match="no episode has ended within 20 steps"),
+        pytest.raises(ValueError, match=r"within 100 steps.*horizon=H.*training alone can do"),
+    ):
+        model.estimate_curvature(2)
 
 
 @pytest.mark.parametrize("normalized", [False, True])

@@ -53,8 +53,10 @@ def configured(cls: Class) -> Class:
         name = type(self).__name__
         if len(args) >= len(positional):  # of which self is one
             raise TypeError(f"{name}: arguments after {positional[-1]} must be given by name")
-        for unknown in kwargs.keys() - names:
-            raise TypeError(f"{name} has no argument {unknown}: {_advice(cls, unknown, names)}")
+        unknown = [key for key in kwargs if key not in names]
+        if unknown:
+            advice = "; ".join(f"{key}: {_advice(cls, key, names)}" for key in unknown)
+            raise TypeError(f"{name} has no argument {advice}")
         init(self, *args, **kwargs)
 
     __init__.__signature__ = inspect.Signature(  # type: ignore[attr-defined]

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 # An environment without a known time limit counts as endless once an episode outlasts the budget
 # of ``learn``, but not before so many steps
 MIN_EPISODE_LIMIT = 1000
+# Outside training there is no budget: an episode as long as this counts as endless
+EVALUATION_EPISODE_LIMIT = 10_000
 
 
 @dataclass
@@ -189,6 +191,8 @@ class TrainingRollouts:
         with bar as tick, self._occupying(model, target):
             with frozen_moments(target):
                 collector = self._collector(model, target)
+                if size.horizon is None and not _has_time_limit(target):
+                    collector.expect_an_end_within(EVALUATION_EPISODE_LIMIT)
                 collector.collect(buffer, ProgressTracker(tick), size)
             if target is model.env:
                 self._leave(model, collector)

@@ -282,7 +282,7 @@ class PolicyNewtonSettings:
         "clip_range": "target_kl bounds the step",
         "clip_range_vf": "the critic's fit is not clipped",
         "n_epochs": "use n_critic_updates; the actor takes one step an update",
-        "ent_coef": "there is no entropy bonus; target_kl keeps the policy from collapsing",
+        "ent_coef": "there is no entropy bonus; a lower target_kl keeps actions random for longer",
         "vf_coef": "actor and critic have separate losses; learning_rate is the critic's",
         "max_grad_norm": "gradients are not clipped; target_kl, or else alpha, bounds the step",
         "rms_prop_eps": "use policy_kwargs=dict(optimizer_kwargs=...), the critic's optimiser",

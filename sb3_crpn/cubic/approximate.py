@@ -239,11 +239,11 @@ def _gradient_descent(problem: _Problem, tolerance: float) -> _Candidate:
             status = f"diverged: gradient_lipschitz < ‖H‖, {lipschitz:.3g} used"
             return _Candidate(zero, zero, status)
         if float(torch.linalg.vector_norm(model_gradient)) <= tolerance:
-            return _Candidate(step, product, f"gradient descent: converged in {count} steps")
+            return _Candidate(step, product, f"descent converged in {count} steps")
         if count < max_steps:
             step = step - model_gradient / (_STEP_DIVISOR * lipschitz)
             product = operator(step)
-    return _Candidate(step, product, f"gradient descent: not converged in {max_steps} steps")
+    return _Candidate(step, product, f"descent stopped at step {max_steps}")
 
 
 def _max_steps(problem: _Problem) -> int:

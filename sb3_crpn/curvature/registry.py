@@ -32,9 +32,10 @@ class Registry(dict[str, Callable[[Any], T]], Generic[T]):
     @property
     def check(self) -> Check:
         """The check of an argument: a registered name, or an object of the protocol."""
-        allowed = f"one of {', '.join(map(repr, self))} or an object of {self._protocol.__name__}"
+        methods = " and ".join(name for name in vars(self._protocol) if not name.startswith("_"))
+        protocol = f"an object of {self._protocol.__name__}, with {methods}"
         return requires(
-            allowed,
+            lambda: f"one of {', '.join(map(repr, self))} or {protocol}",
             lambda value: (
                 value in self
                 if isinstance(value, str)

@@ -108,6 +108,8 @@ def test_unknown_arguments(algorithm):
 
     with pytest.raises(TypeError, match=r"^Derived has no argument clip_range: target_kl bounds"):
         Derived("MlpPolicy", Drift(), clip_range=0.2)
+    with pytest.raises(TypeError, match=r"argument clip_range: .*; ent_coef: there is no entropy"):
+        algorithm("MlpPolicy", Drift(), clip_range=0.2, ent_coef=0.01)
     with pytest.raises(TypeError, match=r"has no argument taget_kl: did you mean target_kl\?"):
         algorithm("MlpPolicy", Drift(), taget_kl=0.2)
     with pytest.raises(TypeError, match=r"no argument xyz: help\(.*\) lists them"):

@@ -166,7 +166,7 @@ def test_running_out_of_steps_is_a_status():
         result = solver(
             problem.gradient, hvp, 1.0, gradient_lipschitz=1.0, epsilon=1e-9, max_steps=7
         )
-        assert result.status == "gradient descent: not converged in 7 steps"
+        assert result.status == "descent stopped at step 7"
         assert result.products == 7
         assert_honest(problem, result, hvp)
 

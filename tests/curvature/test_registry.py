@@ -33,8 +33,10 @@ def test_names_are_made_from_the_arguments_and_objects_are_themselves():
 
 @pytest.mark.parametrize("value", ["cat", 5, None, float("nan"), Dog, ["dog"]])
 def test_what_is_neither_is_refused(value):
-    with pytest.raises(
-        ValueError, match="is not allowed, must be one of 'dog' or an object of Animal"
-    ) as e:
-        Registry(Animal, {"dog": lambda _: Dog()}).check("pet", value)
+    animals = Registry(Animal, {"dog": lambda _: Dog()})
+    check = animals.check  # as in a class that is defined before the name is
+    animals["puppy"] = lambda _: Dog()
+    allowed = "must be one of 'dog', 'puppy' or an object of Animal, with sound"
+    with pytest.raises(ValueError, match=f"is not allowed, {allowed}") as e:
+        check("pet", value)
     assert f"pet={value!r}" in str(e.value)
