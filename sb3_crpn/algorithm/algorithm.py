@@ -19,16 +19,17 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_crpn.algorithm.checkpoint import ResumableAlgorithm
-from sb3_crpn.algorithm.critic import fit_critic, fuse
+from sb3_crpn.algorithm.critic import fit_critic, fuse, has_own_parameters
 from sb3_crpn.algorithm.declaration import check_setting, check_settings, configured
 from sb3_crpn.algorithm.distributed_training import share_policy
 from sb3_crpn.algorithm.evaluation import CandidateEvaluator
 from sb3_crpn.algorithm.kl_control import KLControl
-from sb3_crpn.algorithm.rollouts import TrainingRollouts, warn_of_endless_episodes
+from sb3_crpn.algorithm.rollouts import TrainingRollouts
 from sb3_crpn.algorithm.settings import LEARNING_RATE, PolicyNewtonSettings, checked_schedule
 from sb3_crpn.algorithm.solvers import SubproblemSolver
 from sb3_crpn.algorithm.statistics import UpdateStats
 from sb3_crpn.algorithm.step import take_step
+from sb3_crpn.algorithm.time_limits import warn_of_endless_episodes
 from sb3_crpn.algorithm.update import UpdateData, local_model, rollout_statistics, step_statistics
 from sb3_crpn.checks import COUNT, FLAG, NONE, POSITIVE, not_allowed, requires
 from sb3_crpn.curvature import HESSIAN_ESTIMATORS, CurvatureEstimate, estimate_curvature
@@ -118,9 +119,8 @@ class PolicyNewtonAlgorithm(ResumableAlgorithm, PolicyNewtonSettings):
         check_settings(self)
         if self.rollout_buffer_class is None:
             is_dict = isinstance(self.observation_space, spaces.Dict)
-            self.rollout_buffer_class = (
-                DictEpisodeRolloutBuffer if is_dict else EpisodeRolloutBuffer
-            )
+            buffer = DictEpisodeRolloutBuffer if is_dict else EpisodeRolloutBuffer
+            self.rollout_buffer_class = buffer
         super()._setup_model()
         fuse(self.policy.optimizer)
         self.rollouts.adopt(vars(self))
@@ -183,8 +183,8 @@ class PolicyNewtonAlgorithm(ResumableAlgorithm, PolicyNewtonSettings):
             data = self._data()
             estimate = self._estimate(data)
             solver = self._update_solver(data.fresh)
-            model = local_model(self, estimate, solver)
             target_kl = self._update_target_kl(data.fresh)
+            model = local_model(self, estimate, solver, target_kl)
             alpha = self.alpha_schedule(self._current_progress_remaining)
             if target_kl is not None:
                 alpha = self.kl_control.first_alpha(alpha)
@@ -207,7 +207,7 @@ class PolicyNewtonAlgorithm(ResumableAlgorithm, PolicyNewtonSettings):
                 target_kl=target_kl,
                 value_loss=value_loss,
             )
-            self.last_update.write(self.logger)
+        self.last_update.write(self.logger)  # an error of the logger undoes no update
 
     @torch.enable_grad()
     def estimate_curvature(
@@ -283,11 +283,11 @@ class PolicyNewtonAlgorithm(ResumableAlgorithm, PolicyNewtonSettings):
         return self.kl_control.scaled_target(self.target_kl, deviation)
 
     def _fit_critic(self, data: UpdateData) -> float | None:
-        """Regress V on the λ-returns; ``None`` where V is not used.
+        """Regress V on the λ-returns; ``None`` where V is not used, or all of it is frozen.
 
         Reused rollouts share the minibatches of the fresh one: their number does not grow.
         """
-        if not self.uses_critic:
+        if not (self.uses_critic and has_own_parameters(self.policy, self.actor)):
             return None
         per_pass = math.ceil(data.fresh.total_steps / self.batch_size)
         return fit_critic(

@@ -42,11 +42,17 @@ class ResumableAlgorithm(OnPolicyAlgorithm):
 
         Every rank but the first seeds them with a hash of ``seed`` and its number.
         """
+        self._saved_random_state = None
         self._seed(None if seed is None else rank_seed(seed))
 
     def _seed(self, seed: int | None) -> None:
         super().set_random_seed(seed)
         self._rng = np.random.default_rng(seed)
+
+    def _setup_model(self) -> None:
+        pending = self._saved_random_state
+        super()._setup_model()  # which seeds
+        self._saved_random_state = pending
 
     def learn(
         self: Self,
@@ -76,9 +82,11 @@ class ResumableAlgorithm(OnPolicyAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        state, self._saved_random_state = self._saved_random_state, None
+        state = self._saved_random_state
         if self.seed is None or reset_num_timesteps:
             state = None
+        elif state is not None and state.get("seed", self.seed) != self.seed:
+            state = None  # the file was loaded with another seed
         if rank() > 0:
             callback, progress_bar = None, False
             self.set_logger(Logger(folder=None, output_formats=[]))
@@ -93,6 +101,7 @@ class ResumableAlgorithm(OnPolicyAlgorithm):
         )
         if not all_finite(self._last_obs):
             moments.restore(before)
+        self._saved_random_state = None
         if state is not None and rank() == 0:
             load_random_state(state, self.device)
             self._rng = state["model"]
@@ -118,7 +127,12 @@ class ResumableAlgorithm(OnPolicyAlgorithm):
         """
         if rank() > 0:
             return
-        self._saved_random_state = {**read_random_state(self.device), "model": self._rng}
+        pending = self._saved_random_state  # of a file from which training has not gone on
+        self._saved_random_state = pending or {
+            **read_random_state(self.device),
+            "model": self._rng,
+            "seed": self.seed,
+        }
         try:
             if not isinstance(path, str | os.PathLike):
                 super().save(path, exclude, include)
@@ -127,7 +141,7 @@ class ResumableAlgorithm(OnPolicyAlgorithm):
             with replaced_in_one_go(file) as stream:
                 super().save(stream, exclude, include)
         finally:
-            self._saved_random_state = None
+            self._saved_random_state = pending
 
 
 @contextmanager

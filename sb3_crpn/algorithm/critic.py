@@ -80,6 +80,16 @@ def fit_critic(
     return float(np.mean(losses)) * scale**2
 
 
+def has_own_parameters(policy: ActorCriticPolicy, actor: ActorParameters) -> bool:
+    """Whether V depends on parameters that are trainable and not the actor's."""
+    return bool(_own_parameters(policy, actor))
+
+
+def _own_parameters(policy: ActorCriticPolicy, actor: ActorParameters) -> list[nn.Parameter]:
+    fixed = {id(tensor) for tensor in actor.tensors}
+    return [p for p in policy.parameters() if p.requires_grad and id(p) not in fixed]
+
+
 def fuse(optimizer: torch.optim.Optimizer) -> None:
     """Let Adam update all tensors in one kernel, unless its user has said how it is to run.
 
@@ -149,8 +159,7 @@ def _average(
     """Replace gradients and loss by their means over all ranks' steps, in one message."""
     if batch.is_whole:
         return loss
-    fixed = {id(tensor) for tensor in actor.tensors}
-    own = [p for p in policy.parameters() if p.requires_grad and id(p) not in fixed]
+    own = _own_parameters(policy, actor)
     gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in own]
     flat = torch.cat([gradient.reshape(-1) for gradient in gradients])
     total = batch.total(n_steps * torch.cat([flat, flat.new_tensor([loss, 1.0])]))

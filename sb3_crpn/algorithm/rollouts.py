@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import copy
@@ -15,6 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_crpn.algorithm.settings import checked_schedule
+from sb3_crpn.algorithm.time_limits import has_time_limit
 from sb3_crpn.arrays import IntArray
 from sb3_crpn.checks import real
 from sb3_crpn.distributed import local_count, world_size
@@ -137,7 +137,7 @@ class TrainingRollouts:
         """Run the environments, counting timesteps and calling back as SB3 does."""
         collector = self._collector(model, env)
         collector.timestep = model.num_timesteps
-        if size.horizon is None and not _has_time_limit(env):
+        if size.horizon is None and not has_time_limit(env):
             budget = math.ceil((model._total_timesteps - model.num_timesteps) / env.num_envs)
             collector.expect_an_end_within(max(budget, 2 * size.n_steps, MIN_EPISODE_LIMIT))
         names = {
@@ -191,11 +191,14 @@ class TrainingRollouts:
         with bar as tick, self._occupying(model, target):
             with frozen_moments(target):
                 collector = self._collector(model, target)
-                if size.horizon is None and not _has_time_limit(target):
+                if size.horizon is None and not has_time_limit(target):
                     collector.expect_an_end_within(EVALUATION_EPISODE_LIMIT)
-                collector.collect(buffer, ProgressTracker(tick), size)
+                try:
+                    collector.collect(buffer, ProgressTracker(tick), size)
+                finally:
+                    if target is model.env:
+                        self._leave(model, collector)
             if target is model.env:
-                self._leave(model, collector)
                 self.interrupted = False
         return buffer
 
@@ -209,6 +212,8 @@ class TrainingRollouts:
                 "pass an environment of its own with env="
             )
         outer, model._collecting = model._collecting, True
+        distribution = model.policy.action_dist  # with gSDE it holds the rollout's noise
+        noise = dict(vars(distribution))
         try:
             yield
         except BaseException:
@@ -216,6 +221,8 @@ class TrainingRollouts:
             raise
         finally:
             model._collecting = outer
+            if outer:
+                vars(distribution).update(noise)
 
     def _collector(self, model: PolicyNewtonAlgorithm, env: VecEnv) -> Collector:
         """Return a collector that goes on where the training environments stand."""
@@ -273,29 +280,3 @@ def _scheduled_sizes(model: PolicyNewtonAlgorithm) -> tuple[int | None, int | No
         return round(checked_schedule(model, name, real(1.0))(model._current_progress_remaining))
 
     return number("n_episodes"), number("n_hessian_episodes")
-
-
-def _has_time_limit(env: VecEnv) -> bool:
-    """Whether the specs of all environments are known, and have a time limit."""
-    specs = _specs(env)
-    return bool(specs) and all(getattr(spec, "max_episode_steps", None) for spec in specs)
-
-
-def warn_of_endless_episodes(env: VecEnv) -> None:
-    """Warn where an environment is registered without a time limit and may thus never end."""
-    for spec in _specs(env):
-        if spec is not None and spec.max_episode_steps is None:
-            warnings.warn(
-                f"{spec.id} has no time limit, and whole episodes are learnt from: if its episodes "
-                'do not end by themselves, pass horizon=H or rollout="timesteps"',
-                stacklevel=4,
-            )
-            return
-
-
-def _specs(env: VecEnv) -> list[Any]:
-    """Return the environments' specs, none where a vectorised environment does not tell."""
-    try:
-        return env.get_attr("spec")
-    except (AttributeError, NotImplementedError):
-        return []

@@ -77,14 +77,20 @@ class UpdateData:
 
 
 def local_model(
-    settings: PolicyNewtonSettings, estimate: CurvatureEstimate, solver: SubproblemSolver
+    settings: PolicyNewtonSettings,
+    estimate: CurvatureEstimate,
+    solver: SubproblemSolver,
+    target_kl: float | None,
 ) -> LocalModel:
-    """Build the cubic model, on a subspace unless the paper's full space is asked for."""
+    """Build the cubic model, on a subspace unless the paper's full space is asked for.
+
+    Trials of steps end the products of the full space: with ``target_kl`` there are several.
+    """
     metric = METRICS.resolve(settings.metric, settings)
     shrinkage = resolve_shrinkage(settings.hessian_shrinkage, settings)
     if solver.needs_matrix(len(estimate.gradient)):
         return subspace_model(estimate, metric, shrinkage)
-    unrestricted = settings.krylov_dim is None and settings.target_kl is None
+    unrestricted = settings.krylov_dim is None and target_kl is None
     if unrestricted and isinstance(metric, Euclidean) and isinstance(shrinkage, Constant):
         return FullModel(estimate, shrinkage.value)
     dim = KRYLOV_DIM if settings.krylov_dim is None else settings.krylov_dim

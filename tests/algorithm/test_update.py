@@ -1,8 +1,12 @@
 import numpy as np
 import pytest
+import torch
+from stable_baselines3.common.logger import Logger
 
+from sb3_crpn import CRPN, PAPER
 from sb3_crpn.algorithm.update import UpdateData
 from tests.policies import frozen_episodes, small_policy
+from tests.training import TrainLog, make
 
 N_FRESH, N_EARLIER = 6, 2
 
@@ -39,3 +43,42 @@ def test_episodes_are_drawn_at_random():
     counts = sum(np.bincount(data.draw(2, None, rng)[0].lengths, minlength=7) for _ in range(600))
     assert counts[1:].sum() == 1200
     assert np.abs(counts[1:] - 200).max() < 5 * np.sqrt(600 * (2 / 6) * (4 / 6))
+
+
+def test_a_target_of_a_subclass_counts_where_the_constructor_has_none():
+    class Bounded(CRPN):
+        def _update_target_kl(self, batch):
+            return 0.01
+
+    log = TrainLog()
+    make(Bounded, solver="krylov", n_steps=32, **PAPER).learn(200, log)
+    assert all(0.0 <= row["kl_divergence"] <= 0.01 for row in log.rows)
+    assert max(row["kl_divergence"] for row in log.rows) > 0.009
+
+
+def test_a_frozen_critic_is_not_fitted():
+    model = make(CRPN)
+    critic = [*model.policy.value_net.parameters()]
+    critic += model.policy.mlp_extractor.value_net.parameters()
+    for parameter in critic:
+        parameter.requires_grad_(False)
+    before, theta = [parameter.clone() for parameter in critic], model.actor.vector
+    model.learn(80)
+    assert all(map(torch.equal, before, critic))
+    assert model.last_update.value_loss is None
+    assert not torch.equal(model.actor.vector, theta)
+
+
+def test_an_error_of_the_logger_undoes_no_update(monkeypatch):
+    def full(logger, key, value, exclude=None):
+        if key == "train/alpha":
+            raise OSError("no space left on device")
+
+    model = make(CRPN)
+    theta = model.actor.vector
+    monkeypatch.setattr(Logger, "record", full)
+    with pytest.raises(OSError, match="no space"):
+        model.learn(80)
+    assert model._n_updates == 1
+    assert model.last_update.accepted
+    assert not torch.equal(model.actor.vector, theta)
