@@ -54,7 +54,7 @@ class ACRPN(PolicyNewtonAlgorithm):
         rollout_buffer: RolloutBuffer,
         n_rollout_steps: int,
     ) -> bool:
-        """Collect whole episodes, unless the last update found an ε-SOSP and is to be the last."""
+        """Collect a rollout, unless the last update found an ε-SOSP and is to be the last."""
         if self.stop_at_sosp and self.last_update is not None and self.last_update.at_sosp:
             return False
         return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)

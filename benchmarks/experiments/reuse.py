@@ -2,8 +2,7 @@
 
     python -m benchmarks.experiments.reuse
 
-Random MDPs with four states and random ends of episodes; γ = 1, λ = 0.95, κ = 0.9, and the exact
-critic.
+Random MDPs with four states and random ends of episodes; γ = 1, λ = 0.95, κ = 0.9, the exact V.
 A policy simulates episodes, then takes natural-gradient steps by the exact gradient, of a fixed KL
 divergence each. After some steps the episodes are reused, with clipped traces, and weighted by
 
