@@ -105,7 +105,7 @@ def test_endless_episodes_end_with_the_budget():
 
 
 def test_an_estimate_of_endless_episodes_ends(monkeypatch):
-    monkeypatch.setattr(rollouts, "EVALUATION_EPISODE_LIMIT", 100)
+    monkeypatch.setattr(rollouts, "EPISODE_LIMIT", 100)
     model = make(CRPN, several(2, bound=np.inf, limit=np.inf), rollout="timesteps")
     with (
         pytest.warns(UserWarning, match="no episode has ended within 20 steps"),

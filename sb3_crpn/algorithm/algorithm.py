@@ -29,7 +29,6 @@ from sb3_crpn.algorithm.settings import LEARNING_RATE, PolicyNewtonSettings, che
 from sb3_crpn.algorithm.solvers import SubproblemSolver
 from sb3_crpn.algorithm.statistics import UpdateStats
 from sb3_crpn.algorithm.step import take_step
-from sb3_crpn.algorithm.time_limits import warn_of_endless_episodes
 from sb3_crpn.algorithm.update import UpdateData, local_model, rollout_statistics, step_statistics
 from sb3_crpn.checks import COUNT, FLAG, NONE, POSITIVE, not_allowed, requires
 from sb3_crpn.curvature import HESSIAN_ESTIMATORS, CurvatureEstimate, estimate_curvature
@@ -42,6 +41,7 @@ from sb3_crpn.episodes import (
     Tracker,
 )
 from sb3_crpn.episodes.running_moments import RunningMoments
+from sb3_crpn.episodes.time_limits import warn_of_endless_episodes
 from sb3_crpn.parameters import ActorParameters
 from sb3_crpn.policy import ActorFinder, unchanged_on_error
 

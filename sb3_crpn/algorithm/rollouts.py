@@ -14,7 +14,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_crpn.algorithm.settings import checked_schedule
-from sb3_crpn.algorithm.time_limits import has_time_limit
 from sb3_crpn.arrays import IntArray
 from sb3_crpn.checks import real
 from sb3_crpn.distributed import local_count, world_size
@@ -27,6 +26,7 @@ from sb3_crpn.episodes import (
     steps_to_quota,
 )
 from sb3_crpn.episodes.running_moments import frozen_moments
+from sb3_crpn.episodes.time_limits import EPISODE_LIMIT, has_time_limit
 from sb3_crpn.progress import progress
 
 if TYPE_CHECKING:
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 # An environment without a known time limit counts as endless once an episode outlasts the budget
 # of ``learn``, but not before so many steps
 MIN_EPISODE_LIMIT = 1000
-# Outside training there is no budget: an episode as long as this counts as endless
-EVALUATION_EPISODE_LIMIT = 10_000
 
 
 @dataclass
@@ -192,7 +190,7 @@ class TrainingRollouts:
             with frozen_moments(target):
                 collector = self._collector(model, target)
                 if size.horizon is None and not has_time_limit(target):
-                    collector.expect_an_end_within(EVALUATION_EPISODE_LIMIT)
+                    collector.expect_an_end_within(EPISODE_LIMIT)
                 try:
                     collector.collect(buffer, ProgressTracker(tick), size)
                 finally:

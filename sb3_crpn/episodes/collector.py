@@ -258,7 +258,7 @@ class Collector:
         if without_end == self._warn_after < self._endless_after:
             warnings.warn(
                 f"no episode has ended within {without_end} steps, and the environment has no time "
-                f"limit that is known: training stops after {self._endless_after} steps without "
+                f"limit that is known: an error follows after {self._endless_after} steps without "
                 "an end",
                 stacklevel=2,
             )

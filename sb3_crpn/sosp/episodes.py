@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_crpn.episodes import (
     Collector,
@@ -20,6 +20,8 @@ from sb3_crpn.episodes import (
     RolloutSize,
 )
 from sb3_crpn.episodes.batch import discount_factors
+from sb3_crpn.episodes.running_moments import frozen_moments
+from sb3_crpn.episodes.time_limits import EPISODE_LIMIT, has_time_limit
 from sb3_crpn.policy import state_values
 from sb3_crpn.progress import Tick
 
@@ -33,22 +35,16 @@ def preserve_state(policy: ActorCriticPolicy, env: VecEnv, seed: int) -> Iterato
     it holds the exploration noise of the rollout in progress.
     """
     training, distribution = policy.training, dict(vars(policy.action_dist))
-    normalizer = unwrap_vec_normalize(env)
-    learns = normalizer is not None and normalizer.training
     devices = [policy.device] if policy.device.type == "cuda" else []
-    with torch.random.fork_rng(devices=devices):
+    with torch.random.fork_rng(devices=devices), frozen_moments(env):
         try:
             torch.manual_seed(seed)
             policy.set_training_mode(False)
-            if normalizer is not None:
-                normalizer.training = False
             yield
         finally:
             policy.set_training_mode(training)
             vars(policy.action_dist).clear()
             vars(policy.action_dist).update(distribution)
-            if normalizer is not None:
-                normalizer.training = learns
 
 
 def collect_episodes(
@@ -77,18 +73,21 @@ def collect_episodes(
     gamma
         γ.
     horizon
-        Maximum length of an episode in steps. ``None``: no limit.
+        Maximum length of an episode in steps. ``None``: no limit but the environment's.
     tick
         Called at the end of each episode.
 
     Raises
     ------
     ValueError
-        A reward is not finite, or no episode ends.
+        A reward is not finite, or no episode ends within ``EPISODE_LIMIT`` steps where no time
+        limit is known.
     """
     collector = Collector(
         policy, env, bootstrap_truncated=False, uses_critic=False, sde_sample_freq=1
     )
+    if horizon is None and not has_time_limit(env):
+        collector.expect_an_end_within(EPISODE_LIMIT)
     collector.reset()
     buffer = _new_buffer(policy, env.num_envs, gamma)
     size = RolloutSize(n_steps=0, n_episodes=n_episodes, horizon=horizon)

@@ -7,6 +7,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_crpn.episodes.batch import episode_starts, episode_time
+from sb3_crpn.sosp import episodes
 from sb3_crpn.sosp.episodes import collect_episodes, preserve_state, with_baseline
 from tests.envs import Drift
 from tests.training import several
@@ -55,6 +56,17 @@ def test_the_baseline_is_the_critic():
     values = policy.predict_values(batch.observations).flatten().detach().numpy()
     added = with_baseline(policy, batch, GAMMA).cost_advantages - batch.cost_advantages
     np.testing.assert_allclose(added, GAMMA ** episode_time(batch.lengths) * values, rtol=1e-5)
+
+
+def test_endless_episodes_end_with_an_error(monkeypatch):
+    monkeypatch.setattr(episodes, "EPISODE_LIMIT", 100)
+    env = several(2, bound=np.inf, limit=np.inf)
+    with (
+        pytest.warns(UserWarning, match="no episode has ended within 20 steps"),
+        pytest.raises(ValueError, match=r"within 100 steps.*horizon=H.*TimeLimit"),
+    ):
+        collect_episodes(policy_of(env), env, 2, gamma=GAMMA)
+    assert collect_episodes(policy_of(env), env, 2, gamma=GAMMA, horizon=300).n_steps == 600
 
 
 def test_actions_reach_the_environment_within_its_bounds():

@@ -7,6 +7,10 @@ from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv
 
+# Where no time limit is known, an episode as long as this counts as endless. Training has its
+# budget instead.
+EPISODE_LIMIT = 10_000
+
 
 def has_time_limit(env: VecEnv) -> bool:
     """Whether the specs of all environments are known, and have a time limit."""
