@@ -67,7 +67,8 @@ def frozen_episodes(policy, lengths=(3, 1, 4, 2), seed=0):
         returns=rng.normal(size=n_steps),
         rewards=rng.normal(size=n_steps),
         log_probs=rng.normal(size=n_steps),
-        terminal_values=rng.normal(size=len(lengths)),
+        next_observations=torch.from_numpy(rng.normal(size=(len(lengths), 2))).float(),
+        bootstrapped=rng.random(len(lengths)) < 0.5,
         times=np.zeros(len(lengths), dtype=int),
         trajectories=np.arange(len(lengths)),
     )

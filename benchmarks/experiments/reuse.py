@@ -153,6 +153,7 @@ def reweighted(model: CRPN, episodes: EpisodeBatch) -> tuple[EpisodeBatch, Float
     batch = replay._reweight(
         episodes,
         values.double().numpy(),
+        np.zeros(episodes.n_episodes),  # they end by themselves
         ratios,
         baseline=True,
         normalize_advantage=False,

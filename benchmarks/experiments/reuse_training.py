@@ -54,9 +54,14 @@ class VisitationReplay(Replay):
     decay: float
 
     def _reweight(
-        self, batch: EpisodeBatch, values: FloatArray, ratios: FloatArray, **weighting: bool
+        self,
+        batch: EpisodeBatch,
+        values: FloatArray,
+        terminal_values: FloatArray,
+        ratios: FloatArray,
+        **weighting: bool,
     ) -> EpisodeBatch:
-        reused = super()._reweight(batch, values, ratios, **weighting)
+        reused = super()._reweight(batch, values, terminal_values, ratios, **weighting)
         weights = visitation_weights(ratios, batch.lengths, self.clip, self.decay)
         return replace(reused, cost_advantages=weights * reused.cost_advantages)
 

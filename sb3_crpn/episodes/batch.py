@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from sb3_crpn.arrays import FloatArray, IntArray, Observations
+from sb3_crpn.arrays import BoolArray, FloatArray, IntArray, Observations
 from sb3_crpn.distributed import (
     all_max,
     all_sum,
@@ -148,8 +148,11 @@ class EpisodeBatch:
         r_i, [T].
     log_probs
         log π(a_i|s_i) of the policy that acted, [T].
-    terminal_values
-        V of the state after each segment's last step, [E]: 0 where it is not bootstrapped.
+    next_observations
+        The state after each segment's last step, first dimension E, as ``observations``.
+    bootstrapped
+        Whether the segment is bootstrapped with V of that state, [E]. After a terminal state it is
+        not, and its row is 0.
     times
         The time of each segment's first step in its trajectory, [E].
     trajectories
@@ -166,7 +169,8 @@ class EpisodeBatch:
     returns: FloatArray
     rewards: FloatArray
     log_probs: FloatArray
-    terminal_values: FloatArray
+    next_observations: Observations
+    bootstrapped: BoolArray
     times: IntArray
     trajectories: IntArray
     unit: Literal["n_episodes", "n_steps"] = "n_episodes"
@@ -261,14 +265,20 @@ class EpisodeBatch:
         ]
 
     def _select(self, episodes: slice | IntArray, steps: slice | IntArray) -> EpisodeBatch:
-        of_episodes = ("lengths", "terminal_values", "times", "trajectories")
+        of_episodes = ("lengths", "bootstrapped", "times", "trajectories")
         chosen: dict[str, Any] = {
             field.name: getattr(self, field.name)[episodes if field.name in of_episodes else steps]
             for field in fields(self)
-            if field.name not in ("observations", "unit")
+            if field.name not in ("observations", "next_observations", "unit")
         }
-        observations = map_observations(self.observations, lambda tensor: tensor[steps])
-        return replace(self, observations=observations, **chosen)
+        return replace(
+            self,
+            observations=map_observations(self.observations, lambda tensor: tensor[steps]),
+            next_observations=map_observations(
+                self.next_observations, lambda tensor: tensor[episodes]
+            ),
+            **chosen,
+        )
 
 
 def concatenate(batches: Sequence[EpisodeBatch]) -> EpisodeBatch:

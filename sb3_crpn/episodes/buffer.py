@@ -181,10 +181,28 @@ class EpisodeRolloutBuffer(RolloutBuffer):
             returns=returns,
             rewards=self.rewards[valid].astype(np.float64),
             log_probs=self.log_probs[valid].astype(np.float64),
-            terminal_values=self._terminal_values,
+            next_observations=self._next_rows(),
+            bootstrapped=np.array([obs is not None for obs in self._next_observations]),
             times=times,
             trajectories=self._of_segments("trajectory") * self.n_envs + self._of_segments("env"),
         )
+
+    def _next_rows(self) -> Observations:
+        """Return the state after each segment in the form of the stored observations, [E, …]."""
+        stored = self.observations
+        if isinstance(stored, dict):
+            return {
+                key: self._next_of(array, [obs and obs[key] for obs in self._next_observations])
+                for key, array in stored.items()
+            }
+        return self._next_of(stored, self._next_observations)
+
+    def _next_of(self, stored: Array, observations: list[Any]) -> torch.Tensor:
+        rows = np.zeros((len(observations), *stored.shape[2:]), dtype=stored.dtype)
+        for row, observation in zip(rows, observations, strict=True):
+            if observation is not None:
+                row[...] = np.reshape(observation, row.shape)
+        return self.to_torch(rows)
 
     def _gather_observations(self, steps: tuple[IntArray, IntArray]) -> Observations:
         if isinstance(self.observations, dict):

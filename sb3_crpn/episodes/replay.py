@@ -9,11 +9,12 @@ import numpy as np
 import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_crpn.arrays import FloatArray
+from sb3_crpn.arrays import FloatArray, IntArray
 from sb3_crpn.episodes.advantages import cost_advantages, generalized_advantages
 from sb3_crpn.episodes.batch import EpisodeBatch
 from sb3_crpn.episodes.buffer import CHUNK
-from sb3_crpn.policy import values_and_log_probs
+from sb3_crpn.episodes.observations import map_observations
+from sb3_crpn.policy import state_values, values_and_log_probs
 
 # ρ̄, where importance ratios are truncated (Ionides, Truncated importance sampling, 2008): bounds
 # their variance, and leaves untouched what a few steps of the usual target_kl do to most actions
@@ -32,11 +33,12 @@ class Replay:
 
         A_i = -min(ρ̄, ρ_i) Â_i,    Â_i = Σ_l (γλ)^l c_{i+1}⋯c_{i+l} δ_{i+l},
 
-    where δ takes the present V, and the critic's target is V(s_i) + c_i Â_i (V-trace; Espeholt et
-    al., IMPALA, ICML 2018, with ρ̄ = c̄ = 1 there). For π = μ these are the cost advantages
-    of a fresh rollout. That μ visited the states is not corrected, as is usual (Queeney et
-    al., Generalized proximal policy optimization with sample reuse, NeurIPS 2021). A rollout is
-    dropped once its effective sample size (Σρ)²/Σρ² falls below half of its steps.
+    where δ takes the present V, also of the state that follows a segment, and the critic's target
+    is V(s_i) + c_i Â_i (V-trace; Espeholt et al., IMPALA, ICML 2018, with ρ̄ = c̄ = 1 there). For
+    π = μ these are the cost advantages of a fresh rollout. That μ visited the states is not
+    corrected, as is usual (Queeney et al., Generalized proximal policy optimization with sample
+    reuse, NeurIPS 2021). A rollout is dropped once its effective sample size (Σρ)²/Σρ² falls below
+    half of its steps.
 
     Parameters
     ----------
@@ -66,16 +68,18 @@ class Replay:
         normalised by itself, as it was when it was fresh.
         """
         seen = [(batch, *_evaluate(policy, batch)) for batch in self._batches]
-        usable = [entry for entry in seen if _is_alike(entry[0], entry[2])]
-        self._batches = deque((batch for batch, _, _ in usable), self._batches.maxlen)
+        usable = [entry for entry in seen if _is_alike(entry[0], entry[-1])]
+        self._batches = deque((entry[0] for entry in usable), self._batches.maxlen)
         return [
-            self._reweight(batch, values, ratios, **weighting) for batch, values, ratios in usable
+            self._reweight(batch, values, terminal_values, ratios, **weighting)
+            for batch, values, terminal_values, ratios in usable
         ]
 
     def _reweight(
         self,
         batch: EpisodeBatch,
         values: FloatArray,
+        terminal_values: FloatArray,
         ratios: FloatArray,
         *,
         baseline: bool,
@@ -85,7 +89,7 @@ class Replay:
         advantages = generalized_advantages(
             batch.rewards,
             values,
-            batch.terminal_values,
+            terminal_values,
             batch.lengths,
             self._gamma,
             self._gae_lambda,
@@ -106,15 +110,36 @@ class Replay:
         )
 
 
-def _evaluate(policy: ActorCriticPolicy, batch: EpisodeBatch) -> tuple[FloatArray, FloatArray]:
-    """Return V(s_i) and ρ_i of the present policy, [T] each."""
+def _evaluate(
+    policy: ActorCriticPolicy, batch: EpisodeBatch
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the present policy's V(s_i), [T], V of the states after segments, [E], and ρ_i, [T].
+
+    V is 0 after segments that are not bootstrapped.
+    """
     values, log_probs = [np.zeros(0)], [np.zeros(0)]
     for piece in batch.chunks(CHUNK):
         value, log_prob = values_and_log_probs(policy, piece.observations, piece.actions)
         values.append(value.cpu().double().numpy())
         log_probs.append(log_prob.cpu().double().numpy())
     with np.errstate(over="ignore"):  # an infinite ratio ends the rollout's use
-        return np.concatenate(values), np.exp(np.concatenate(log_probs) - batch.log_probs)
+        ratios: FloatArray = np.exp(np.concatenate(log_probs) - batch.log_probs)
+    return np.concatenate(values), _terminal_values(policy, batch), ratios
+
+
+def _terminal_values(policy: ActorCriticPolicy, batch: EpisodeBatch) -> FloatArray:
+    values = np.zeros(batch.n_episodes)
+    known = np.flatnonzero(batch.bootstrapped)
+    for start in range(0, len(known), CHUNK):
+        rows = known[start : start + CHUNK]
+
+        def chosen(observations: torch.Tensor, rows: IntArray = rows) -> torch.Tensor:
+            return observations[rows]
+
+        with torch.no_grad():
+            found = state_values(policy, map_observations(batch.next_observations, chosen))
+        values[rows] = found.cpu().double().numpy()
+    return values
 
 
 def _is_alike(batch: EpisodeBatch, ratios: FloatArray) -> bool:

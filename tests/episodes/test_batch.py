@@ -67,7 +67,7 @@ def test_time_and_starts_of_episodes_laid_end_to_end():
 def numbered_batch(lengths, *, is_dict=False):
     """Every array holds the indices of its steps."""
     steps = np.arange(float(sum(lengths)))
-    tensor = torch.from_numpy(steps)
+    tensor, ends = torch.from_numpy(steps), torch.arange(float(len(lengths)))
     return EpisodeBatch(
         observations={"a": tensor, "b": -tensor[:, None]} if is_dict else tensor[:, None],
         actions=tensor.long(),
@@ -77,7 +77,8 @@ def numbered_batch(lengths, *, is_dict=False):
         returns=-steps,
         rewards=2 * steps,
         log_probs=3 * steps,
-        terminal_values=np.arange(float(len(lengths))),
+        next_observations={"a": ends, "b": -ends[:, None]} if is_dict else ends[:, None],
+        bootstrapped=np.arange(len(lengths)) % 2 == 1,
         times=np.zeros(len(lengths), dtype=int),
         trajectories=np.arange(len(lengths)),
     )
@@ -95,6 +96,9 @@ def test_take_selects_whole_episodes_in_the_order_given(is_dict):
     assert taken.cost_advantages.tolist() == steps
     assert taken.values.tolist() == [i + 0.5 for i in steps]
     assert taken.returns.tolist() == [-i for i in steps]
+    assert taken.bootstrapped.tolist() == [False, False]
+    ends = taken.next_observations["a"] if is_dict else taken.next_observations.flatten()
+    assert ends.tolist() == [2, 0]
     if is_dict:
         assert taken.observations["a"].tolist() == steps
         assert taken.observations["b"].tolist() == [[-i] for i in steps]

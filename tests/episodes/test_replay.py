@@ -23,6 +23,13 @@ def evaluated(policy, batch):
     return values.flatten().double().numpy(), log_probs.double().numpy()
 
 
+def terminal_values(policy, batch):
+    with torch.no_grad():
+        values = policy.predict_values(batch.next_observations).flatten().double().numpy()
+    assert 0 < batch.bootstrapped.sum() < batch.n_episodes
+    return np.where(batch.bootstrapped, values, 0.0)
+
+
 def rollout(policy, **arguments):
     """Episodes with the log-probabilities of the behaviour policy ``policy``."""
     batch = frozen_episodes(policy, **arguments)
@@ -52,7 +59,7 @@ def test_rollout_of_the_present_policy_has_the_weights_of_a_fresh_one(
     batch = rollout(policy)
     values = evaluated(policy, batch)[0]
     advantages = generalized_advantages(
-        batch.rewards, values, batch.terminal_values, batch.lengths, GAMMA, GAE_LAMBDA
+        batch.rewards, values, terminal_values(policy, batch), batch.lengths, GAMMA, GAE_LAMBDA
     )
     options = {
         "normalize_advantage": normalize_advantage,
@@ -88,7 +95,13 @@ def test_weights_follow_the_formula_after_the_policy_has_moved(kind, scale):
     (again,) = kept(batch).reweighted(policy, **RAW)
     traces = np.minimum(1.0, ratios)
     advantages = generalized_advantages(
-        batch.rewards, values, batch.terminal_values, batch.lengths, GAMMA, GAE_LAMBDA, traces
+        batch.rewards,
+        values,
+        terminal_values(policy, batch),
+        batch.lengths,
+        GAMMA,
+        GAE_LAMBDA,
+        traces,
     )
     np.testing.assert_allclose(again.cost_advantages, -np.minimum(MAX_RATIO, ratios) * advantages)
     np.testing.assert_allclose(again.returns, values + traces * advantages)
@@ -119,7 +132,7 @@ def test_reused_bandit_gives_the_exact_gradient_and_curvature_of_the_present_pol
         actions=torch.as_tensor(actions),
         rewards=rewards[actions],
         log_probs=np.log(old[actions]),
-        terminal_values=np.zeros(1200),
+        bootstrapped=np.zeros(1200, dtype=bool),
     )
     (again,) = kept(batch).reweighted(policy, **RAW)
     group = EpisodeDerivatives(policy, actor, again, Causal(1.0))

@@ -200,8 +200,39 @@ def test_segments_are_bootstrapped_with_the_value_of_the_state_that_follows(
     assert batch.lengths.tolist() == [1, 3, 1, 5]
     assert batch.times.tolist() == [2, 0, 0, 5]
     assert len({*batch.trajectories}) == 4
-    np.testing.assert_allclose(batch.terminal_values, [end, end, values[1], values[10]], rtol=1e-5)
+    assert batch.bootstrapped.tolist() == [end != 0.0] * 2 + [True] * 2
+    followers = values[batch.next_observations.flatten().long()]
+    np.testing.assert_allclose(
+        np.where(batch.bootstrapped, followers, 0.0), [end, end, values[1], values[10]]
+    )
     assert abs(values[1]) > 1e-3
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Box(-1.0, 1.0, (3,)),
+        spaces.Discrete(4),
+        spaces.MultiDiscrete([3, 2]),
+        spaces.MultiBinary(3),
+        spaces.Box(0, 255, (36, 36, 1), np.uint8),
+        spaces.Dict(a=spaces.Discrete(3), b=spaces.Box(-1.0, 1.0, (2,))),
+    ],
+    ids=["box", "discrete", "multi-discrete", "multi-binary", "image", "dict"],
+)
+def test_the_state_that_follows_is_kept_as_the_policy_takes_it(space):
+    image, is_dict = len(space.shape or ()) == 3, isinstance(space, spaces.Dict)
+    policy = "MultiInputPolicy" if is_dict else "CnnPolicy" if image else "MlpPolicy"
+    env = DummyVecEnv([lambda: Sampler(space, spaces.Discrete(2))] * 2)
+    apart = {"share_features_extractor": False}  # V is as it was
+    arguments = {"rollout": "timesteps", "n_steps": 6, "n_critic_updates": 0}
+    model = make(CRPN, env, policy=policy, policy_kwargs=apart, **arguments)
+    batch = trained(model)._batch(model.rollout_buffer)
+    values = model.policy.predict_values(batch.next_observations).flatten().detach().numpy()
+    np.testing.assert_allclose(
+        np.where(batch.bootstrapped, values, 0.0), model.rollout_buffer._terminal_values, rtol=1e-5
+    )
+    assert batch.bootstrapped.tolist() == [False] * 2 + [True] * 2
 
 
 def test_advantages_are_those_of_sb3_where_no_time_limit_ends_an_episode():

@@ -119,7 +119,8 @@ def test_estimates_of_single_episodes_are_attained():
         returns=np.zeros(H),
         rewards=np.zeros(H),
         log_probs=np.zeros(H),
-        terminal_values=np.zeros(1),
+        next_observations=torch.zeros(1, 2, dtype=torch.float64),
+        bootstrapped=np.zeros(1, dtype=bool),
         times=np.zeros(1, dtype=int),
         trajectories=np.arange(1),
     )
