@@ -4,16 +4,16 @@
     python -m benchmarks.wallclock --table
 
 A run is at the level when the mean return of its latest training episodes is: no evaluation adds
-to the time, and all learners are asked the same. It is given its entry's own number of steps.
-The numbers of environments are the entry's and those asked for; an update keeps the entry's number
-of steps, as far as whole episodes allow. Runs take turns in one process, and those that the CSV
-holds are not repeated.
+to the time, and all learners are asked the same. It is given its entry's own number of steps. The
+numbers of environments are the entry's and those asked for. Where CRPN has an entry for so many
+environments (``zoo_configs/crpn_16_envs.yml``), that is taken; else an update keeps the entry's
+number of steps, as far as whole episodes allow. Runs take turns in one process, and those that the
+CSV holds are not repeated.
 """
 
 from __future__ import annotations
 
 import argparse
-import inspect
 import itertools
 import sys
 import tempfile
@@ -33,8 +33,7 @@ from benchmarks.common.markdown import estimate, markdown
 from benchmarks.common.pool import run_all
 from benchmarks.common.table import Table
 from benchmarks.learning.run import Run, make_run, set_up, versions
-from benchmarks.learning.settings import resolve
-from sb3_crpn import CRPN
+from benchmarks.learning.settings import changes_for, resolve
 
 RESULTS = Path(__file__).with_suffix(".csv")
 KEYS = ("env", "arm", "n_envs", "seed")
@@ -54,14 +53,8 @@ LEVELS = {
     "Acrobot-v1": Level(-100.0),
     "HalfCheetah-v5": Level(2000.0, 10),  # of 1,000 steps each
 }
-# Algorithm and overrides of its entry
-ARMS: dict[str, tuple[str, dict[str, Any]]] = {
-    "CRPN": ("CRPN", {}),
-    "CRPN, timesteps": ("CRPN", {"rollout": "timesteps"}),
-    "TRPO": ("TRPO", {}),
-    "PPO": ("PPO", {}),
-}
-OURS = ("CRPN", "CRPN, timesteps")
+OURS = "CRPN"
+ARMS = (OURS, "TRPO", "PPO")
 
 
 class Job(NamedTuple):
@@ -90,14 +83,15 @@ def jobs(
 
 def make_job(arm: str, env: str, n_envs: int | None, seed: int) -> Job:
     """Return a run of the arm's entry in so many environments; ``None``: the entry's own."""
-    algo, overrides = ARMS[arm]
-    entry = resolve(algo, env, {})[1]
+    entry = resolve(arm, env, {})[1]
     published = entry.get("n_envs", 1)
-    sizes: dict[str, int] = {}
+    overrides: dict[str, Any] = {}
     if n_envs is not None and n_envs != published:
-        sizes["n_envs"] = n_envs
-        sizes["n_steps"] = max(1, entry["n_steps"] * published // n_envs)
-    run = make_run(algo, env, seed, overrides | sizes, timesteps=int(entry["n_timesteps"]))
+        n_steps = max(1, entry["n_steps"] * published // n_envs)
+        overrides = {"n_envs": n_envs, "n_steps": n_steps}
+        if arm == OURS:
+            overrides = changes_for(env, n_envs) or overrides
+    run = make_run(arm, env, seed, overrides, timesteps=int(entry["n_timesteps"]))
     return Job(arm, n_envs or published, run, LEVELS[env])
 
 
@@ -179,7 +173,7 @@ def _best_lines(rows: pd.DataFrame) -> Iterator[list[str]]:
     for env, of_env in rows.groupby("env", sort=False):
         arms = {key: runs for key, runs in of_env.groupby(["arm", "n_envs"]) if runs.reached.all()}
         ours, peers = (
-            [key for key in arms if (key[0] in OURS) == is_ours] for is_ours in (True, False)
+            [key for key in arms if (key[0] == OURS) == is_ours] for is_ours in (True, False)
         )
         if not ours or not peers:
             continue
@@ -195,15 +189,14 @@ def _best_lines(rows: pd.DataFrame) -> Iterator[list[str]]:
 
 def main() -> None:
     """Run what is missing, print the tables."""
-    arms = [arm for arm, (_, extra) in ARMS.items() if arm not in OURS or _has(extra)]
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.wallclock",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--envs", nargs="+", default=list(LEVELS), choices=list(LEVELS))
-    parser.add_argument("--arms", nargs="+", default=arms, choices=arms, metavar="ARM",
-                        help=f"default: {'; '.join(arms)}")  # fmt: skip
+    parser.add_argument("--arms", nargs="+", default=ARMS, choices=ARMS, metavar="ARM",
+                        help=f"default: {' '.join(ARMS)}")  # fmt: skip
     parser.add_argument("--n-envs", type=int, nargs="*", default=N_ENVS, metavar="N")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--results", type=Path, default=RESULTS)
@@ -224,11 +217,6 @@ def main() -> None:
 
 def _keep(table: Table, job: Job, row: dict[str, Any]) -> None:
     table.append([job.key | row])
-
-
-def _has(arguments: dict[str, Any]) -> bool:
-    """Return whether CRPN's constructor takes these arguments."""
-    return arguments.keys() <= inspect.signature(CRPN).parameters.keys()
 
 
 if __name__ == "__main__":

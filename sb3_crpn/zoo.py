@@ -101,7 +101,11 @@ def zoo_options(options: Sequence[str]) -> list[str]:
 
 
 def config_file(name: str) -> Path:
-    """Return the path of ``zoo_configs/NAME.yml``: crpn, acrpn, crpn_paper or acrpn_paper."""
+    """Return the path of ``zoo_configs/NAME.yml``.
+
+    crpn and acrpn are the defaults of ``sb3-crpn train``, crpn_paper and acrpn_paper the paper's
+    experiments; crpn_16_envs and crpn_64_envs are for so many environments.
+    """
     installed = Path(str(resources.files("sb3_crpn"))) / "zoo_configs"
     folder = installed if installed.is_dir() else installed.parents[1] / "zoo_configs"
     return folder / f"{name}.yml"

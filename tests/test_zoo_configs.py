@@ -63,6 +63,16 @@ def test_keys_are_arguments(algo, name):
         assert set(entry) - arguments <= RL_ZOO, env
 
 
+@pytest.mark.parametrize("n_envs", [16, 64])
+def test_entries_for_many_environments_say_all_that_the_usual_ones_say(n_envs):
+    many, usual = entries(f"crpn_{n_envs}_envs"), entries("crpn")
+    assert list(many) == ["CartPole-v1", "Pendulum-v1", "Hopper-v5", "HalfCheetah-v5"]
+    for env_id, entry in many.items():
+        assert usual[env_id].keys() <= entry.keys()
+        assert entry["n_envs"] == n_envs
+        CRPN(env=env_id, **{key: entry[key] for key in entry.keys() - RL_ZOO - {"policy_kwargs"}})
+
+
 @pytest.mark.parametrize("env_id", [*CLASSIC, *BOX2D, *MUJOCO, *ROBOTICS])
 def test_entries_build_models(env_id):
     env = gym.make(env_id)

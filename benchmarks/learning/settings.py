@@ -157,6 +157,14 @@ def resolve(
     return name, {**entry, **overrides}
 
 
+def changes_for(env_id: str, n_envs: int) -> dict[str, Any]:
+    """Return what CRPN's entry for so many environments changes in its usual one; {} without."""
+    path = zoo.config_file(f"crpn_{n_envs}_envs")
+    entry = _load(path).get(env_id, {}) if path.is_file() else {}
+    usual = resolve("CRPN", env_id, {})[1]
+    return {key: value for key, value in entry.items() if usual.get(key) != value}
+
+
 def _equal_settings(entry: Mapping[str, Any], env_id: str) -> dict[str, Any]:
     """Return an entry of CRPN's as TRPO's: the arguments that both constructors have.
 

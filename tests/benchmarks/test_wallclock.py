@@ -5,10 +5,12 @@ from importlib.util import find_spec
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 
 from benchmarks import wallclock
 from benchmarks.common.table import Table
 from benchmarks.wallclock import KEYS, Level, UntilLevel, jobs, make_job, tables
+from sb3_crpn.zoo import config_file
 
 pytestmark = pytest.mark.skipif(find_spec("rl_zoo3") is None, reason="needs the zoo extra")
 
@@ -66,9 +68,12 @@ def test_tables_compare_the_fastest_that_always_get_there():
     assert "TRPO" not in best
 
 
-def test_an_argument_that_the_constructor_lacks_is_no_arm():
-    assert wallclock._has({"target_kl": 0.1})
-    assert not wallclock._has({"rollouts": 3})
+def test_crpn_has_entries_for_many_environments():
+    run = make_job("CRPN", "CartPole-v1", 64, 0).run
+    entry = yaml.safe_load(config_file("crpn_64_envs").read_text())["CartPole-v1"]
+    assert {key: run.arguments[key] for key in entry} == entry
+    assert make_job("CRPN", "Acrobot-v1", 64, 0).run.setting == "n_envs=64,n_steps=8"
+    assert "n_reused_rollouts" not in make_job("TRPO", "CartPole-v1", 64, 0).run.arguments
 
 
 def test_the_command_measures_resumes_and_prints(tmp_path, monkeypatch, capsys):
