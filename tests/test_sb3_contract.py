@@ -380,6 +380,7 @@ LOGGED = {
     "multiplier",
     "predicted_decrease",
     "lambda_min",
+    "confirmed_lambda_min",
     "hessian_vector_products",
     "step_rejected",
     "hessian_shrinkage",

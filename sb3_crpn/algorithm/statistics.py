@@ -49,6 +49,9 @@ class UpdateStats:
         Whether ACRPN's solver found θ to be an ε-second-order stationary point.
     lambda_min
         Leftmost eigenvalue of H relative to M that the model or the solver saw; nan if none.
+    confirmed_lambda_min
+        The curvature along such an eigenvector in episodes that did not choose it; nan where the
+        model is not a subspace's, and from one episode.
     hessian_vector_products
         Products with H, or with the metric's generator, spent on the update.
     hessian_shrinkage
@@ -88,6 +91,7 @@ class UpdateStats:
     solver_status: str
     at_sosp: bool
     lambda_min: float
+    confirmed_lambda_min: float
     hessian_vector_products: int
     hessian_shrinkage: float
     mean_reward: float

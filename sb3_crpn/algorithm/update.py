@@ -120,6 +120,7 @@ def step_statistics(
         # the ranks' solves agree to rounding: the end of training is rank 0's decision
         "at_sosp": bool(batch.agreed(torch.tensor(cubic.at_sosp))),
         "lambda_min": model.lambda_min(cubic),
+        "confirmed_lambda_min": model.confirmed_lambda_min,
         "hessian_vector_products": model.products(cubic),
         "hessian_shrinkage": model.shrinkage,
     }

@@ -38,6 +38,11 @@ class LocalModel(Protocol):
         """Return the leftmost eigenvalue of H relative to M, as the model or the solver saw it."""
         ...
 
+    @property
+    def confirmed_lambda_min(self) -> float:
+        """The curvature of other episodes along a leftmost eigenvector; nan where unknown."""
+        ...
+
     def products(self, step: CubicStep) -> int:
         """Return the Hessian-vector products that the model and ``step`` cost."""
         ...
@@ -75,6 +80,11 @@ class FullModel:
         """Return the leftmost Ritz value of ωH that the solver saw."""
         return step.lambda_min
 
+    @property
+    def confirmed_lambda_min(self) -> float:
+        """nan: it would cost products."""
+        return float("nan")
+
     def products(self, step: CubicStep) -> int:
         """Return the solver's products."""
         return step.products
@@ -96,6 +106,8 @@ class SubspaceModel:
         ω.
     leftmost
         Leftmost eigenvalue of H (not shrunk) on the basis, relative to M.
+    confirmed_lambda_min
+        What is left of it in episodes that did not choose the eigenvector; nan from one group.
     """
 
     gradient: torch.Tensor
@@ -103,6 +115,7 @@ class SubspaceModel:
     basis: torch.Tensor
     shrinkage: float
     leftmost: float
+    confirmed_lambda_min: float
 
     def product(self, coordinates: torch.Tensor) -> torch.Tensor:
         """Return ωH y from the matrix."""
@@ -157,7 +170,29 @@ def subspace_model(
         basis=basis @ W.T.to(basis),
         shrinkage=omega,
         leftmost=float(torch.linalg.eigvalsh(mean)[0]),
+        confirmed_lambda_min=confirmed_minimum(hessians, hessian.weights.to(hessians.device)),
     )
+
+
+def confirmed_minimum(hessians: torch.Tensor, weights: torch.Tensor) -> float:
+    """Return Σ_k w_k u_kᵀ H_k u_k, u_k the leftmost eigenvector of Σ_{j≠k} w_j H_j.
+
+    The smallest eigenvalue of a noisy matrix is too small: its eigenvector is chosen for the noise.
+    The group k has not chosen u_k, so that for independent H_k this is the mean curvature of the
+    true matrix along such eigenvectors. It is at least the true smallest eigenvalue, on average.
+
+    Parameters
+    ----------
+    hessians
+        H_k in coordinates where M = I, float64 [K, n, n]; nan for K = 1.
+    weights
+        w_k, Σ w_k = 1, [K].
+    """
+    if len(hessians) < 2:
+        return float("nan")
+    weighted = weights[:, None, None] * hessians
+    vectors = torch.linalg.eigh(weighted.sum(0) - weighted).eigenvectors[:, :, 0]
+    return float(torch.einsum("ki,kij,kj->", vectors, weighted, vectors))
 
 
 def _start(gradient: torch.Tensor) -> torch.Tensor:

@@ -1,5 +1,7 @@
+import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -14,6 +16,7 @@ from sb3_crpn.curvature import (
     estimate_curvature,
     subspace_model,
 )
+from sb3_crpn.curvature.local_model import confirmed_minimum
 from tests.policies import frozen_episodes, small_policy
 
 ALPHA = 3.0
@@ -87,6 +90,35 @@ def test_leftmost_eigenvalue_is_that_of_the_unshrunk_hessian(estimate, metric):
     M, H = matrix_of(metric, estimate), estimate.hessian.to_dense()
     eigenvalues = torch.linalg.eigvals(torch.linalg.solve(M, H)).real
     assert model.lambda_min(STEP) == pytest.approx(eigenvalues.min().item(), abs=1e-9)
+
+
+@METRICS
+def test_the_confirmed_eigenvalue_is_seen_by_the_other_episodes(estimate, metric):
+    model = subspace_model(estimate, metric, Constant(0.1))
+    W = model.basis.T
+    first, second = W @ estimate.hessian.group_forms(torch.eye(len(W.T)).double()) @ W.T
+    weights = estimate.hessian.weights
+    curvatures = [
+        vectors[:, 0] @ judge @ vectors[:, 0]
+        for judge, chooser in ((first, second), (second, first))
+        for vectors in [torch.linalg.eigh(chooser).eigenvectors]
+    ]
+    expected = float(weights @ torch.stack(curvatures))
+    assert model.confirmed_lambda_min == pytest.approx(expected, abs=1e-9)
+    assert model.confirmed_lambda_min > model.lambda_min(STEP)
+
+
+def test_noise_is_not_confirmed_and_curvature_is():
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(200, 2, 8, 8, dtype=torch.float64, generator=generator)
+    noise = noise + noise.transpose(2, 3)
+    weights = torch.tensor([0.3, 0.7], dtype=torch.float64)
+    curved = torch.diag(torch.tensor([-30.0, *range(7)])).double()
+    for matrix, low, high in ((0.0 * curved, -0.5, 0.5), (curved, -30.0, -28.0)):
+        found = [confirmed_minimum(matrix + groups, weights) for groups in noise]
+        assert low < np.mean(found) < high
+    assert max(torch.linalg.eigvalsh(groups[0])[0].item() for groups in noise) < -2.0
+    assert math.isnan(confirmed_minimum(curved[None], torch.ones(1).double()))
 
 
 @METRICS
