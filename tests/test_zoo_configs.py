@@ -66,7 +66,7 @@ def test_keys_are_arguments(algo, name):
 @pytest.mark.parametrize("n_envs", [16, 64])
 def test_entries_for_many_environments_say_all_that_the_usual_ones_say(n_envs):
     many, usual = entries(f"crpn_{n_envs}_envs"), entries("crpn")
-    assert list(many) == ["CartPole-v1", "Pendulum-v1", "Hopper-v5", "HalfCheetah-v5"]
+    assert list(many) == ["CartPole-v1", "Acrobot-v1", "Pendulum-v1", "Hopper-v5", "HalfCheetah-v5"]
     for env_id, entry in many.items():
         assert usual[env_id].keys() <= entry.keys()
         assert entry["n_envs"] == n_envs

@@ -72,7 +72,7 @@ def test_crpn_has_entries_for_many_environments():
     run = make_job("CRPN", "CartPole-v1", 64, 0).run
     entry = yaml.safe_load(config_file("crpn_64_envs").read_text())["CartPole-v1"]
     assert {key: run.arguments[key] for key in entry} == entry
-    assert make_job("CRPN", "Acrobot-v1", 64, 0).run.setting == "n_envs=64,n_steps=8"
+    assert make_job("CRPN", "CartPole-v1", 8, 0).run.setting == "n_envs=8,n_steps=64"
     assert "n_reused_rollouts" not in make_job("TRPO", "CartPole-v1", 64, 0).run.arguments
 
 
