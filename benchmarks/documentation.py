@@ -17,9 +17,10 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from benchmarks import distributed
+from benchmarks import distributed, wallclock
 from benchmarks.common.markdown import estimate, markdown
-from benchmarks.learning import comparison, equal, store, tables
+from benchmarks.common.table import Table
+from benchmarks.learning import comparison, equal, rollouts, store, tables
 from benchmarks.learning.comparison import Comparison
 from benchmarks.learning.settings import TRPO_EQUAL
 from benchmarks.learning.statistics import interquartile_mean, stratified_bootstrap
@@ -151,6 +152,21 @@ def ranks() -> str:
     return "\n\n".join(distributed.tables(distributed.RESULTS.read()))
 
 
+def compared_rollouts() -> str:
+    """Return what whole episodes and timesteps reach, at equal settings."""
+    return rollouts.table(store.read_runs(rollouts.RESULTS))
+
+
+def many_environments() -> str:
+    """Return the settings that were tried for 16 and 64 environments."""
+    return rollouts.table(store.read_runs(LEARNING / "many"))
+
+
+def seconds_to_a_level() -> str:
+    """Return the times of all arms, and CRPN's best in the best peer's."""
+    return "\n\n".join(wallclock.tables(Table(wallclock.RESULTS, wallclock.KEYS).read()))
+
+
 def _cells(found: Comparison, labels: Sequence[str], task: str, column: str) -> list[str]:
     return [tables.mean_cell(found.values(label, task, column)) for label in labels]
 
@@ -175,8 +191,11 @@ TABLES: dict[str, Callable[[], str]] = {
     "distributed": ranks,
     "headline": headline,
     "learners": learners,
+    "many": many_environments,
     "published": published,
+    "rollouts": compared_rollouts,
     "theory": theory_table,
+    "wallclock": seconds_to_a_level,
 }
 
 if __name__ == "__main__":

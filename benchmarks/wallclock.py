@@ -169,9 +169,14 @@ def _median(runs: pd.DataFrame, column: str) -> str:
 
 
 def _best_lines(rows: pd.DataFrame) -> Iterator[list[str]]:
-    """Yield a line a task: arms that always reach the level, the fastest by median wall time."""
+    """Yield a line a task: the fastest, by median wall time, that reach the level on all seeds."""
     for env, of_env in rows.groupby("env", sort=False):
-        arms = {key: runs for key, runs in of_env.groupby(["arm", "n_envs"]) if runs.reached.all()}
+        n_seeds = of_env.groupby(["arm", "n_envs"]).size().max()
+        arms = {
+            key: runs
+            for key, runs in of_env.groupby(["arm", "n_envs"])
+            if runs.reached.all() and len(runs) == n_seeds > 1
+        }
         ours, peers = (
             [key for key in arms if (key[0] == OURS) == is_ours] for is_ours in (True, False)
         )

@@ -2,6 +2,7 @@
 
     python -m benchmarks.learning.rollouts --jobs 1   # run what is missing
     python -m benchmarks.learning.rollouts --table
+    python -m benchmarks.learning.rollouts --table --results benchmarks/learning/many
 
 Settings are those of CRPN's entries. With other numbers of environments an update keeps the entry's
 timesteps, as far as whole episodes allow. Stages come in the order in which they decide a default;
@@ -16,7 +17,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -25,7 +26,7 @@ from benchmarks.common.markdown import estimate, markdown
 from benchmarks.common.pool import run_all
 from benchmarks.learning import store
 from benchmarks.learning.run import Run, execute, make_run
-from benchmarks.learning.settings import BUDGETS, parse_setting, resolve
+from benchmarks.learning.settings import BUDGETS, parse_setting, resolve, setting_label
 
 RESULTS = Path(__file__).parent / "rollout"
 ROLLOUTS = ("episodes", "timesteps")
@@ -101,13 +102,15 @@ def _size(env: str, n_envs: int) -> dict[str, int]:
 
 
 def table(runs: pd.DataFrame) -> str:
-    """Return means over seeds with 95 % intervals: one line an environment, size and rollout."""
-    head = ["environment", "timesteps", "environments", "rollout", "seeds", "mean over training",
-            "final", "episodes", "CPU s"]  # fmt: skip
+    """Return means over seeds with 95 % intervals: one line an environment and setting."""
+    head = ["environment", "timesteps", "environments", "rollout", "other changes", "seeds",
+            "mean over training", "final", "episodes", "CPU s"]  # fmt: skip
     settings = runs["setting"].map(parse_setting)
     size = settings.map(lambda setting: setting.get("n_envs", "entry's"))
     rollout = settings.map(lambda setting: setting.get("rollout", "episodes"))
-    keys = [runs["env"], runs["timesteps"], size.rename("n_envs"), rollout.rename("rollout")]
+    others = settings.map(_other_changes)
+    keys = [runs["env"], runs["timesteps"], size.rename("n_envs"), rollout.rename("rollout"),
+            others.rename("others")]  # fmt: skip
     body = [
         [
             *key,
@@ -120,6 +123,10 @@ def table(runs: pd.DataFrame) -> str:
         for key, group in runs.groupby(keys, sort=True)
     ]
     return markdown(head, body)
+
+
+def _other_changes(setting: dict[str, Any]) -> str:
+    return setting_label({k: v for k, v in setting.items() if k not in ("n_envs", "rollout")})
 
 
 if __name__ == "__main__":

@@ -213,8 +213,8 @@ def test_the_table_of_rollouts() -> None:
     )
     lines = rollouts.table(runs).splitlines()[2:]
     assert lines == [
-        "| CartPole-v1 | 100 | 16 | timesteps | 1 | 5 | 7 | 8 | 5 |",
-        "| CartPole-v1 | 100 | entry's | episodes | 2 | 20 [10, 30] | 20 [20, 20] | 5 | 2 |",
+        "| CartPole-v1 | 100 | 16 | timesteps | n_steps=32 | 1 | 5 | 7 | 8 | 5 |",
+        "| CartPole-v1 | 100 | entry's | episodes |  | 2 | 20 [10, 30] | 20 [20, 20] | 5 | 2 |",
     ]
 
 

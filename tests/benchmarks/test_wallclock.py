@@ -59,6 +59,7 @@ def test_tables_compare_the_fastest_that_always_get_there():
         ]
         for seed in range(3)
     ]  # fmt: skip
+    rows.append(rows[0] | {"arm": "TRPO", "n_envs": 8, "wall_seconds": 0.1})  # one seed alone
     arms, best = tables(pd.DataFrame(rows))
     assert "| CartPole-v1: 475 | TRPO | 2 | 0 of 3 | > 1 | > 2 | > 1,000 |" in arms
     line = "| CartPole-v1: 475 | CRPN | 8 | 3 of 3 | 4.00 [4.00, 4.00] | 8.00 [8.00, 8.00] |"
