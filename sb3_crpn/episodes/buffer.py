@@ -182,7 +182,7 @@ class EpisodeRolloutBuffer(RolloutBuffer):
             rewards=self.rewards[valid].astype(np.float64),
             log_probs=self.log_probs[valid].astype(np.float64),
             next_observations=self._next_rows(),
-            bootstrapped=np.array([obs is not None for obs in self._next_observations]),
+            bootstrapped=np.array([obs is not None for obs in self._next_observations], np.bool_),
             times=times,
             trajectories=self._of_segments("trajectory") * self.n_envs + self._of_segments("env"),
         )
