@@ -2,17 +2,16 @@
 
     python -m benchmarks.experiments.reuse
 
-Random MDPs with four states and random ends of episodes; γ = 1, λ = 0.95, κ = 0.9, the exact V.
-A policy simulates episodes, then takes natural-gradient steps by the exact gradient, of a fixed KL
-divergence each. After some steps the episodes are reused, with clipped traces, and weighted by
+Random MDPs of four states, episodes with random ends; γ = 1, λ = 0.95, κ = 0.9, the exact V.
+A policy simulates episodes, and takes exact natural-gradient steps of a fixed KL divergence each.
+After some steps the episodes are reused, with clipped traces, and weighted by
 
-- ``later action``: the ratio of each step's action; in H, that of the later action of a pair of
-  steps, as CRPN does;
+- ``later action``: the ratio of each step's action, in H of a pair's later one, as CRPN does;
 - ``both actions``: in H the ratio of the earlier action too;
 - ``visitation``: the later action's, and for the states that the old policy visited
   exp(clip(Σ_{j<i} log ρ_j, ±c)), of mean 1, for several c.
 
-Errors are relative to what fresh episodes estimate on average, which is known exactly.
+Errors are relative to the exact expectation of fresh episodes' estimates.
 """
 
 from __future__ import annotations
@@ -153,7 +152,7 @@ def reweighted(model: CRPN, episodes: EpisodeBatch) -> tuple[EpisodeBatch, Float
     batch = replay._reweight(
         episodes,
         values.double().numpy(),
-        np.zeros(episodes.n_episodes),  # they end by themselves
+        np.zeros(episodes.n_episodes),
         ratios,
         baseline=True,
         normalize_advantage=False,

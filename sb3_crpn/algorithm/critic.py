@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from sb3_crpn.arrays import Observations
 from sb3_crpn.episodes import EpisodeBatch
-from sb3_crpn.episodes.observations import map_observations
+from sb3_crpn.episodes.observations import take_rows
 from sb3_crpn.parameters import ActorParameters
 from sb3_crpn.policy import state_values
 
@@ -70,7 +70,7 @@ def fit_critic(
     with _in_units(layer, shift, scale):
         for chosen in _minibatches(batch, n_minibatches, batch_size, rng, policy.device):
             policy.optimizer.zero_grad()
-            loss = _backward(policy, _at(batch.observations, chosen), returns[chosen])
+            loss = _backward(policy, take_rows(batch.observations, chosen), returns[chosen])
             for parameter in actor.tensors:
                 parameter.grad = None  # the optimiser passes over it
             losses.append(_average(policy, actor, batch, loss, len(chosen)))
@@ -167,10 +167,6 @@ def _average(
     for parameter, gradient in zip(own, means, strict=True):
         parameter.grad = gradient.view_as(parameter).to(parameter.dtype)
     return float(last[0])
-
-
-def _at(observations: Observations, steps: torch.Tensor) -> Observations:
-    return map_observations(observations, lambda tensor: tensor[steps])
 
 
 def _units(batch: EpisodeBatch, largest: float) -> tuple[float, float]:

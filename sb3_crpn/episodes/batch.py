@@ -20,7 +20,7 @@ from sb3_crpn.distributed import (
     rank,
     world_size,
 )
-from sb3_crpn.episodes.observations import map_observations
+from sb3_crpn.episodes.observations import take_rows
 
 moments = mean_and_variance  # of what is no batch yet, over all ranks
 
@@ -273,10 +273,8 @@ class EpisodeBatch:
         }
         return replace(
             self,
-            observations=map_observations(self.observations, lambda tensor: tensor[steps]),
-            next_observations=map_observations(
-                self.next_observations, lambda tensor: tensor[episodes]
-            ),
+            observations=take_rows(self.observations, steps),
+            next_observations=take_rows(self.next_observations, episodes),
             **chosen,
         )
 

@@ -12,10 +12,10 @@ from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import DictRolloutBufferSamples, RolloutBufferSamples
 
-from sb3_crpn.arrays import Array, FloatArray, IntArray, Observations
+from sb3_crpn.arrays import Array, BoolArray, FloatArray, IntArray, Observations
 from sb3_crpn.episodes.advantages import cost_advantages, generalized_advantages
 from sb3_crpn.episodes.batch import EpisodeBatch, episode_time
-from sb3_crpn.episodes.observations import stack_observations
+from sb3_crpn.episodes.observations import take_rows
 from sb3_crpn.episodes.tracker import Segment
 from sb3_crpn.policy import state_values, to_tensor, values_and_log_probs
 
@@ -84,7 +84,7 @@ class EpisodeRolloutBuffer(RolloutBuffer):
         valid = self._valid_steps()
         if policy is not None:
             self._evaluate(policy, *valid)
-        self._terminal_values = self._bootstrapped(policy)
+        self._terminal_values = bootstrap_values(policy, self._next_rows(), self._bootstrapped)
         if len(valid[0]) < self.rewards.size:
             self._estimate_all(policy, last_observations, valid)
         self._compute_advantages(*valid)
@@ -113,16 +113,10 @@ class EpisodeRolloutBuffer(RolloutBuffer):
             self.values[steps] = values.cpu().numpy()
             self.log_probs[steps] = log_probs.cpu().numpy()
 
-    def _bootstrapped(self, policy: ActorCriticPolicy | None) -> FloatArray:
-        """Return V of the state after each segment, [E]; 0 after a terminal state."""
-        values = np.zeros(len(self._segments))
-        known = [i for i, obs in enumerate(self._next_observations) if obs is not None]
-        for start in range(0, len(known), CHUNK):
-            chosen = known[start : start + CHUNK]
-            stacked = stack_observations([self._next_observations[i] for i in chosen])
-            assert policy is not None  # by uses_critic, where anything is bootstrapped
-            values[chosen] = values_of(policy, stacked)
-        return values
+    @property
+    def _bootstrapped(self) -> BoolArray:
+        """Whether each segment is bootstrapped with V of the state after it, [E]."""
+        return np.array([obs is not None for obs in self._next_observations], dtype=np.bool_)
 
     def _estimate_all(
         self,
@@ -182,13 +176,13 @@ class EpisodeRolloutBuffer(RolloutBuffer):
             rewards=self.rewards[valid].astype(np.float64),
             log_probs=self.log_probs[valid].astype(np.float64),
             next_observations=self._next_rows(),
-            bootstrapped=np.array([obs is not None for obs in self._next_observations], np.bool_),
+            bootstrapped=self._bootstrapped,
             times=times,
             trajectories=self._of_segments("trajectory") * self.n_envs + self._of_segments("env"),
         )
 
     def _next_rows(self) -> Observations:
-        """Return the state after each segment in the form of the stored observations, [E, …]."""
+        """Return the state after each segment as observations are stored, [E, …]; 0 for none."""
         stored = self.observations
         if isinstance(stored, dict):
             return {
@@ -245,3 +239,21 @@ def values_of(policy: ActorCriticPolicy, observations: Any) -> FloatArray:
     with torch.no_grad():
         values = state_values(policy, to_tensor(policy, observations))
     return values.cpu().double().numpy()
+
+
+def bootstrap_values(
+    policy: ActorCriticPolicy | None, next_observations: Observations, bootstrapped: BoolArray
+) -> FloatArray:
+    """Return V of the state after each segment, float64 [E]; 0 where it is not bootstrapped.
+
+    ``policy`` may be ``None`` where nothing is.
+    """
+    values = np.zeros(len(bootstrapped))
+    known = np.flatnonzero(bootstrapped)
+    for start in range(0, len(known), CHUNK):
+        rows = known[start : start + CHUNK]
+        assert policy is not None  # by uses_critic
+        with torch.no_grad():
+            found = state_values(policy, take_rows(next_observations, rows))
+        values[rows] = found.cpu().double().numpy()
+    return values

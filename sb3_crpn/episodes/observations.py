@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-from sb3_crpn.arrays import Observations
+from sb3_crpn.arrays import IntArray, Observations
 
 
 def all_finite(value: Any) -> bool:
@@ -43,16 +43,6 @@ def as_arrays(observations: Any) -> Any:
     return np.asarray(observations)
 
 
-def stack_observations(observations: list[Any]) -> Any:
-    """Lay single observations of equal shapes, arrays or dicts of them, along a first axis."""
-    if isinstance(observations[0], dict):
-        return {
-            key: np.stack([observation[key] for observation in observations])
-            for key in observations[0]
-        }
-    return np.stack(observations)
-
-
 def map_observations(
     observations: Observations, function: Callable[[torch.Tensor], torch.Tensor]
 ) -> Observations:
@@ -60,3 +50,8 @@ def map_observations(
     if isinstance(observations, dict):
         return {key: function(tensor) for key, tensor in observations.items()}
     return function(observations)
+
+
+def take_rows(observations: Observations, rows: slice | IntArray | torch.Tensor) -> Observations:
+    """Return the chosen ``rows`` of the observation tensor, or of each one of a dict."""
+    return map_observations(observations, lambda tensor: tensor[rows])

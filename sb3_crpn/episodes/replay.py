@@ -9,12 +9,11 @@ import numpy as np
 import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_crpn.arrays import FloatArray, IntArray
+from sb3_crpn.arrays import FloatArray
 from sb3_crpn.episodes.advantages import cost_advantages, generalized_advantages
 from sb3_crpn.episodes.batch import EpisodeBatch
-from sb3_crpn.episodes.buffer import CHUNK
-from sb3_crpn.episodes.observations import map_observations
-from sb3_crpn.policy import state_values, values_and_log_probs
+from sb3_crpn.episodes.buffer import CHUNK, bootstrap_values
+from sb3_crpn.policy import values_and_log_probs
 
 # ρ̄, where importance ratios are truncated (Ionides, Truncated importance sampling, 2008): bounds
 # their variance, and leaves untouched what a few steps of the usual target_kl do to most actions
@@ -124,22 +123,8 @@ def _evaluate(
         log_probs.append(log_prob.cpu().double().numpy())
     with np.errstate(over="ignore"):  # an infinite ratio ends the rollout's use
         ratios: FloatArray = np.exp(np.concatenate(log_probs) - batch.log_probs)
-    return np.concatenate(values), _terminal_values(policy, batch), ratios
-
-
-def _terminal_values(policy: ActorCriticPolicy, batch: EpisodeBatch) -> FloatArray:
-    values = np.zeros(batch.n_episodes)
-    known = np.flatnonzero(batch.bootstrapped)
-    for start in range(0, len(known), CHUNK):
-        rows = known[start : start + CHUNK]
-
-        def chosen(observations: torch.Tensor, rows: IntArray = rows) -> torch.Tensor:
-            return observations[rows]
-
-        with torch.no_grad():
-            found = state_values(policy, map_observations(batch.next_observations, chosen))
-        values[rows] = found.cpu().double().numpy()
-    return values
+    terminal_values = bootstrap_values(policy, batch.next_observations, batch.bootstrapped)
+    return np.concatenate(values), terminal_values, ratios
 
 
 def _is_alike(batch: EpisodeBatch, ratios: FloatArray) -> bool:

@@ -26,7 +26,7 @@ from sb3_crpn.checks import (
     real,
 )
 from sb3_crpn.episodes.batch import EpisodeBatch
-from sb3_crpn.episodes.observations import map_observations
+from sb3_crpn.episodes.observations import take_rows
 from sb3_crpn.parameters import ActorParameters
 from sb3_crpn.policy import find_actor
 from sb3_crpn.progress import load_bar, progress
@@ -224,7 +224,7 @@ def _infer(
 
 
 def _actor(policy: ActorCriticPolicy, batch: EpisodeBatch) -> ActorParameters:
-    first = map_observations(batch.observations, lambda tensor: tensor[:1])
+    first = take_rows(batch.observations, slice(1))
     return find_actor(policy, first)
 
 

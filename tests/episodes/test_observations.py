@@ -8,7 +8,7 @@ from sb3_crpn.episodes.observations import (
     as_arrays,
     as_observation,
     map_observations,
-    stack_observations,
+    take_rows,
 )
 
 
@@ -48,13 +48,13 @@ def test_batches_of_lists_become_arrays():
     np.testing.assert_array_equal(as_arrays({"a": [1, 2]})["a"], [1, 2])
 
 
-def test_single_observations_are_stacked_key_by_key():
-    first, second = {"a": np.zeros(2)}, {"a": np.ones(2)}
-    np.testing.assert_array_equal(stack_observations([first, second])["a"], [[0, 0], [1, 1]])
-    assert stack_observations([np.zeros(2)] * 3).shape == (3, 2)
-
-
 def test_map_observations_reaches_every_key():
     doubled = map_observations({"a": torch.ones(2)}, lambda tensor: 2.0 * tensor)
     assert doubled["a"].tolist() == [2.0, 2.0]
     assert map_observations(torch.ones(1), torch.neg).tolist() == [-1.0]
+
+
+def test_rows_are_taken_key_by_key():
+    pair = torch.arange(6.0).reshape(3, 2)
+    assert take_rows(pair, np.array([2, 0])).tolist() == [[4.0, 5.0], [0.0, 1.0]]
+    assert take_rows({"a": pair}, slice(1))["a"].tolist() == [[0.0, 1.0]]
