@@ -45,15 +45,12 @@ class Stage(NamedTuple):
 
 
 STAGES = (
-    Stage(("CartPole-v1", "Pendulum-v1"), 2),
-    Stage(("HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Ant-v5"), 1, timesteps=150_000),
     Stage(("CartPole-v1", "Pendulum-v1", "Acrobot-v1"), 5),
-    Stage(("LunarLander-v3",), 3),
-    Stage(("CartPole-v1", "Pendulum-v1"), 3, n_envs=(16, 64)),
-    Stage(("HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Ant-v5"), 3, timesteps=150_000),
-    Stage(("HalfCheetah-v5", "Hopper-v5"), 3, n_envs=(1, 16), timesteps=150_000),
     Stage(("HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Ant-v5", "Humanoid-v5"), 5,
           timesteps=300_000),
+    Stage(("LunarLander-v3",), 3),
+    Stage(("CartPole-v1", "Pendulum-v1"), 3, n_envs=(1, 16, 64)),
+    Stage(("HalfCheetah-v5", "Hopper-v5"), 2, n_envs=(16,), timesteps=150_000),
 )  # fmt: skip
 
 

@@ -24,7 +24,7 @@ from sb3_crpn.algorithm.declaration import check_setting, check_settings, config
 from sb3_crpn.algorithm.distributed_training import share_policy
 from sb3_crpn.algorithm.evaluation import CandidateEvaluator
 from sb3_crpn.algorithm.kl_control import KLControl
-from sb3_crpn.algorithm.rollouts import TrainingRollouts
+from sb3_crpn.algorithm.rollouts import TrainingRollouts, make_tracker
 from sb3_crpn.algorithm.settings import LEARNING_RATE, PolicyNewtonSettings, checked_schedule
 from sb3_crpn.algorithm.solvers import SubproblemSolver
 from sb3_crpn.algorithm.statistics import UpdateStats
@@ -33,15 +33,12 @@ from sb3_crpn.algorithm.update import UpdateData, local_model, rollout_statistic
 from sb3_crpn.checks import COUNT, FLAG, NONE, POSITIVE, not_allowed, requires
 from sb3_crpn.curvature import HESSIAN_ESTIMATORS, CurvatureEstimate, estimate_curvature
 from sb3_crpn.episodes import (
-    TRACKERS,
     DictEpisodeRolloutBuffer,
     EpisodeBatch,
     EpisodeRolloutBuffer,
     Replay,
-    Tracker,
 )
 from sb3_crpn.episodes.running_moments import RunningMoments
-from sb3_crpn.episodes.time_limits import warn_of_endless_episodes
 from sb3_crpn.parameters import ActorParameters
 from sb3_crpn.policy import ActorFinder, unchanged_on_error
 
@@ -126,15 +123,7 @@ class PolicyNewtonAlgorithm(ResumableAlgorithm, PolicyNewtonSettings):
         self.rollouts.adopt(vars(self))
         self.alpha_schedule = checked_schedule(self, "alpha", POSITIVE)
         self.replay = Replay(self.n_reused_rollouts, self.gamma, self.gae_lambda)
-        kind = TRACKERS[self.rollout] if isinstance(self.rollout, str) else self.rollout
-        self.tracker: Tracker = kind()
-        if not self.tracker.whole_episodes:
-            for name in ("n_episodes", "n_hessian_episodes"):
-                if (value := getattr(self, name)) is not None:
-                    argument = f"{type(self).__name__}: {name}"
-                    raise not_allowed(argument, value, "None where rollouts are of timesteps")
-        if self.env is not None and self.tracker.whole_episodes and self.horizon is None:
-            warn_of_endless_episodes(self.env)
+        self.tracker = make_tracker(self)
 
     def _setup_lr_schedule(self) -> None:
         self.lr_schedule = checked_schedule(self, "learning_rate", LEARNING_RATE)
@@ -152,8 +141,7 @@ class PolicyNewtonAlgorithm(ResumableAlgorithm, PolicyNewtonSettings):
 
     def __getstate__(self) -> dict[str, Any]:
         """Let a copy that is made in mid-rollout be in none: its environments are reset first."""
-        in_none = {"_collecting": False, "rollouts": replace(self.rollouts, interrupted=True)}
-        return vars(self) | (in_none if self._collecting else {})
+        return vars(self) | {"_collecting": False}
 
     def _excluded_save_params(self) -> list[str]:
         derived = ["alpha_schedule", "lr_schedule", "replay", "tracker", "ranks", "_actors"]
@@ -162,7 +150,11 @@ class PolicyNewtonAlgorithm(ResumableAlgorithm, PolicyNewtonSettings):
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         self.replay.clear()  # the environment may be another one
         self.last_update = None
-        return super()._setup_learn(*args, **kwargs)
+        before = self._last_obs
+        prepared = super()._setup_learn(*args, **kwargs)
+        if self._last_obs is not before:  # all environments were reset
+            self.rollouts.interrupted = False
+        return prepared
 
     def collect_rollouts(
         self,

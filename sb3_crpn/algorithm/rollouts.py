@@ -15,18 +15,20 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_crpn.algorithm.settings import checked_schedule
 from sb3_crpn.arrays import IntArray
-from sb3_crpn.checks import real
+from sb3_crpn.checks import not_allowed, real
 from sb3_crpn.distributed import local_count, world_size
 from sb3_crpn.episodes import (
+    TRACKERS,
     Collector,
     EpisodeRolloutBuffer,
     ProgressTracker,
     RolloutSize,
+    Tracker,
     Transition,
     steps_to_quota,
 )
 from sb3_crpn.episodes.running_moments import frozen_moments
-from sb3_crpn.episodes.time_limits import EPISODE_LIMIT, has_time_limit
+from sb3_crpn.episodes.time_limits import EPISODE_LIMIT, has_time_limit, warn_of_endless_episodes
 from sb3_crpn.progress import progress
 
 if TYPE_CHECKING:
@@ -54,7 +56,7 @@ class TrainingRollouts:
     trajectory_times
         The time of each training environment's next step in its trajectory, [n_envs].
     interrupted
-        Whether it is not known where the training environments stand.
+        Whether it is not known where the training environments stand, as in mid-rollout.
     """
 
     mean_episode_length: float | None = None
@@ -161,7 +163,6 @@ class TrainingRollouts:
                 model.num_timesteps = collector.timestep
                 if env is model.env:  # a callback may have set another
                     self._leave(model, collector)
-        self.interrupted = not completed
         self.mean_reward = collector.mean_reward
         return completed
 
@@ -186,25 +187,21 @@ class TrainingRollouts:
         buffer.n_envs = target.num_envs
         size = _share(RolloutSize(model.n_steps, n_episodes, model.horizon))
         bar = progress("episodes", size.n_episodes, show=show)
-        with bar as tick, self._occupying(model, target):
-            with frozen_moments(target):
-                collector = self._collector(model, target)
-                if size.horizon is None and not has_time_limit(target):
-                    collector.expect_an_end_within(EPISODE_LIMIT)
-                try:
-                    collector.collect(buffer, ProgressTracker(tick), size)
-                finally:
-                    if target is model.env:
-                        self._leave(model, collector)
-            if target is model.env:
-                self.interrupted = False
+        with bar as tick, self._occupying(model, target), frozen_moments(target):
+            collector = self._collector(model, target)
+            if size.horizon is None and not has_time_limit(target):
+                collector.expect_an_end_within(EPISODE_LIMIT)
+            try:
+                collector.collect(buffer, ProgressTracker(tick), size)
+            finally:
+                if target is model.env:
+                    self._leave(model, collector)
         return buffer
 
     @contextmanager
     def _occupying(self, model: PolicyNewtonAlgorithm, env: VecEnv) -> Iterator[None]:
         """Mark the time of a rollout: the training environment serves one at a time."""
-        is_training_env = env is model.env
-        if model._collecting and is_training_env:
+        if model._collecting and env is model.env:
             raise RuntimeError(
                 "the training environment is in the middle of a rollout: "
                 "pass an environment of its own with env="
@@ -214,16 +211,16 @@ class TrainingRollouts:
         noise = dict(vars(distribution))
         try:
             yield
-        except BaseException:
-            self.interrupted |= is_training_env
-            raise
         finally:
             model._collecting = outer
             if outer:
                 vars(distribution).update(noise)
 
     def _collector(self, model: PolicyNewtonAlgorithm, env: VecEnv) -> Collector:
-        """Return a collector that goes on where the training environments stand."""
+        """Return a collector that goes on where the training environments stand.
+
+        Until :meth:`_leave`, a file or a copy of the model does not know where that is.
+        """
         model.policy.set_training_mode(False)
         collector = Collector(
             model.policy,
@@ -232,12 +229,15 @@ class TrainingRollouts:
             uses_critic=model.uses_critic,
             sde_sample_freq=model.sde_sample_freq,
         )
-        if env is model.env and model._last_obs is not None:
-            collector.stand(model._last_obs, self._times(model))
-            if self.interrupted and collector.can_reset:
-                collector.reset()
-        else:
+        if env is not model.env or model._last_obs is None:
             collector.reset()
+            return collector
+        times = self._times(model)
+        was_interrupted, self.interrupted = self.interrupted, True
+        if was_interrupted and collector.can_reset:
+            collector.reset()
+        else:
+            collector.stand(model._last_obs, times)
         return collector
 
     def _times(self, model: PolicyNewtonAlgorithm) -> IntArray:
@@ -256,12 +256,32 @@ class TrainingRollouts:
         model._last_obs = collector.observations
         model._last_episode_starts = collector.at_episode_start
         self.trajectory_times = collector.times
+        self.interrupted = not collector.located
 
     def adopt(self, attributes: dict[str, Any]) -> None:
         """Take over what older files hold as attributes of the model, which they lose."""
         for field in fields(self):
             if (name := f"_{field.name}") in attributes:
                 setattr(self, field.name, attributes.pop(name))
+
+
+def make_tracker(model: PolicyNewtonAlgorithm) -> Tracker:
+    """Return the tracker that ``rollout`` names; check the arguments that depend on its kind."""
+    kind = TRACKERS[model.rollout] if isinstance(model.rollout, str) else model.rollout
+    tracker, name = kind(), type(model).__name__
+    if not hasattr(tracker, "whole_episodes"):
+        raise not_allowed(f"{name}: rollout", kind, '"episodes", "timesteps" or a class of Tracker')
+    if tracker.whole_episodes:
+        if model.env is not None and model.horizon is None:
+            warn_of_endless_episodes(model.env)
+        return tracker
+    for argument in ("n_episodes", "n_hessian_episodes"):
+        if (value := getattr(model, argument)) is not None:
+            raise not_allowed(f"{name}: {argument}", value, "None where rollouts are of timesteps")
+    if model.normalize_advantage and model.n_steps * model.n_envs * world_size() == 1:
+        allowed = "above 1 in all environments together, with normalize_advantage=True"
+        raise not_allowed(f"{name}: n_steps", model.n_steps, allowed)
+    return tracker
 
 
 def _share(size: RolloutSize) -> RolloutSize:

@@ -233,16 +233,17 @@ def _gradient_descent(problem: _Problem, tolerance: float) -> _Candidate:
     max_norm = 3 / rho * (lipschitz / 2 + math.sqrt(lipschitz**2 / 4 + 2 / 3 * force))
     for count in range(max_steps + 1):
         norm = torch.linalg.vector_norm(step)
-        model_gradient = g + product + rho / 2 * norm * step
-        if float(norm) > max_norm:
+        if not (math.isfinite(norm) and norm <= max_norm):
             zero = torch.zeros_like(g)
             status = f"diverged: gradient_lipschitz < ‖H‖, {lipschitz:.3g} used"
             return _Candidate(zero, zero, status)
+        if count > 0:
+            product = operator(step)
+        model_gradient = g + product + rho / 2 * norm * step
         if float(torch.linalg.vector_norm(model_gradient)) <= tolerance:
             return _Candidate(step, product, f"descent converged in {count} steps")
         if count < max_steps:
             step = step - model_gradient / (_STEP_DIVISOR * lipschitz)
-            product = operator(step)
     return _Candidate(step, product, f"descent stopped at step {max_steps}")
 
 

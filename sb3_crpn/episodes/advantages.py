@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 from scipy.linalg import solve_banded
 
 from sb3_crpn.arrays import FloatArray, IntArray
 from sb3_crpn.episodes.batch import discount_factors, episode_scan, episode_starts, moments
+
+# A rollout whose largest γ^t is smaller is warned of
+NEGLIGIBLE = 1e-3
 
 
 def generalized_advantages(
@@ -71,11 +75,19 @@ def cost_advantages(
 
     ``times``, [E], is that of each segment's first step. Â is normalised to mean 0 and standard
     deviation 1 over the batch of all ranks on request; without ``discount_visitation`` the factor
-    γ^i is dropped.
+    γ^i is dropped. A warning says where γ^i is negligible throughout: on endless tasks.
     """
     if normalize_advantage:
         mean, variance = moments(advantages)
         advantages = (advantages - mean) / (math.sqrt(variance) + 1e-8)  # 1e-8: as in SB3's PPO
     if discount_visitation:
-        advantages = advantages * discount_factors(gamma, lengths, times)
+        factors = discount_factors(gamma, lengths, times)
+        if len(factors) and factors.max() < NEGLIGIBLE:
+            warnings.warn(
+                f"every timestep of the rollout weighs less than {NEGLIGIBLE}: with "
+                "discount_visitation=True the weight is γ^t, t timesteps after the environment's "
+                "reset. Pass discount_visitation=False, or an environment with a time limit",
+                stacklevel=2,
+            )
+        advantages = advantages * factors
     return -advantages

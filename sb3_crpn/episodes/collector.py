@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_crpn.arrays import Array, BoolArray, FloatArray, IntArray, Observations
 from sb3_crpn.episodes.buffer import EpisodeRolloutBuffer
@@ -64,6 +64,8 @@ class Collector:
     observations, times
         Where the environments stand, [n_envs, …], and the time of each one's next step in its
         trajectory, [n_envs]: 0 after a reset.
+    located
+        Whether these are known: not before the first reset, nor after an error in an environment.
     mean_reward
         The mean over the steps of the last rollout, in the environment's own units.
     timestep
@@ -82,6 +84,7 @@ class Collector:
         self.policy, self.env = policy, env
         self.observations: Any = None
         self.times: IntArray = np.zeros(env.num_envs, dtype=np.int64)
+        self.located = False
         self.timestep = 0
         self.mean_reward = 0.0
         self._endless_after = self._warn_after = ENDLESS
@@ -89,9 +92,7 @@ class Collector:
         self._uses_critic = uses_critic
         self._sde_sample_freq = sde_sample_freq
         self.can_reset = _early_resets_allowed(env)
-        normalizer = unwrap_vec_normalize(env)
-        self._moments = RunningMoments(normalizer)
-        self._raw_rewards = _raw_rewards(normalizer)
+        self._moments = RunningMoments(unwrap_vec_normalize(env))
         self._start_time = time.time()
 
     @property
@@ -104,13 +105,16 @@ class Collector:
         """Say where the environments stand."""
         self.observations, self.times = as_arrays(observations), times
         self._require_finite("observation", self.observations)
+        self.located = True
 
     def reset(self) -> None:
         """Reset all environments."""
         before = self._moments.snapshot()
+        self.located = False
         self.observations = as_arrays(self.env.reset())
         self.times = np.zeros(self.env.num_envs, dtype=np.int64)
         self._require_finite("observation", self.observations, before)
+        self.located = True
 
     def expect_an_end_within(self, n_steps: int) -> None:
         """Take the environments for endless after ``n_steps`` steps; warn after a fifth of them.
@@ -151,10 +155,10 @@ class Collector:
             transition = self._step()
             recording = tracker.recording
             segments = list(tracker.advance(transition.dones))
-            raw_rewards = self._raw_rewards(transition.rewards)
-            self._reward_sum += float(raw_rewards.sum())
+            unscaled = self._moments.raw_rewards(transition.rewards)
+            self._reward_sum += float(unscaled.sum())
             if size.horizon is not None and tracker.whole_episodes:
-                self._report_cut_episodes(segments, recording, transition, raw_rewards)
+                self._report_cut_episodes(segments, recording, transition, unscaled)
             if not on_step(transition):
                 return False
             actions, rewards = transition.actions, transition.rewards
@@ -184,6 +188,7 @@ class Collector:
         actions = sample_actions(self.policy, obs_tensor)
         clipped_actions = environment_actions(self.policy, actions)
         before = self._moments.snapshot()
+        self.located = False
         new_obs, rewards, dones, infos = self.env.step(clipped_actions)
         self._n_steps += 1
         self.timestep += self.env.num_envs
@@ -193,6 +198,7 @@ class Collector:
         dones = np.asarray(dones).astype(np.bool_)
         # at once: whatever interrupts the rollout from here on, this is where they stand
         self.observations, self.times = new_obs, np.where(dones, 0, self.times + 1)
+        self.located = True
         return Transition(
             self._n_steps, obs_tensor, actions, clipped_actions, new_obs, rewards, dones, infos
         )
@@ -223,10 +229,10 @@ class Collector:
         segments: list[Segment],
         recording: BoolArray,
         transition: Transition,
-        raw_rewards: FloatArray,
+        unscaled: FloatArray,
     ) -> None:
         """Report an episode that the horizon cut as ``Monitor`` would, and only those recorded."""
-        self._returns += raw_rewards
+        self._returns += unscaled
         for env in np.flatnonzero(~recording & transition.dones):
             transition.infos[env].pop("episode", None)
         for segment in segments:
@@ -288,10 +294,3 @@ def _early_resets_allowed(env: VecEnv) -> bool:
             except AttributeError:  # a vectorised environment that keeps the statistics itself
                 continue
     return True
-
-
-def _raw_rewards(normalizer: VecNormalize | None) -> Callable[[FloatArray], FloatArray]:
-    """Return what turns the last step's rewards into those before ``VecNormalize`` scaled them."""
-    if normalizer is None or not normalizer.norm_reward:
-        return lambda rewards: rewards
-    return lambda rewards: normalizer.get_original_reward()

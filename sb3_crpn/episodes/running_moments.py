@@ -37,6 +37,12 @@ class RunningMoments:
             return 1.0
         return math.sqrt(float(normalizer.ret_rms.var) + normalizer.epsilon)
 
+    def raw_rewards(self, rewards: FloatArray) -> FloatArray:
+        """Return the last step's rewards as they were before ``VecNormalize`` scaled them."""
+        if self._normalizer is None or not self._normalizer.norm_reward:
+            return rewards
+        return self._normalizer.get_original_reward()
+
     def read(self) -> Moments:
         """Return (count, mean, variance) of each."""
         # by reference: SB3 replaces the arrays, and never writes them

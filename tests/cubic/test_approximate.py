@@ -180,6 +180,16 @@ def test_a_lipschitz_constant_far_too_small_is_a_status():
         assert result.predicted_decrease == 0
 
 
+@pytest.mark.parametrize("scale", [1e-156, 1e-158, 1e-160, 1e-163])
+def test_a_hessian_that_all_but_vanishes_leads_nowhere(scale):
+    """Where the step overflows, no product is asked for."""
+    gradient = torch.zeros(10, dtype=torch.float64)
+    result = cubic_subsolver(
+        gradient, lambda vector: scale * vector, 0.1, gradient_lipschitz=scale, max_steps=50
+    )
+    assert not result.step.any()
+
+
 def test_global_generators_are_untouched_and_the_seed_decides():
     problem = spectral("", [-1.0, 1.0, 2.0], [0.0, 0.1, 0.1])
     state = torch.random.get_rng_state()

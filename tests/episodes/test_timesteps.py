@@ -123,11 +123,73 @@ def test_the_time_is_known_after_a_rollout_that_was_interrupted(early_resets):
     model = clocks(4, np.inf, early_resets=early_resets)
     model.learn(100, While(lambda: model.num_timesteps < 26))
     assert model.num_timesteps == 26
-    assert model.rollouts.interrupted
     trained(model)
     assert knows_the_time(model)
-    longest = model.rollout_buffer._of_segments("time").max()
-    assert longest == (0 if early_resets else 13)
+    assert model.rollout_buffer._of_segments("time").max() == 13  # no environment was reset
+
+
+def test_calls_of_learn_that_a_callback_ends_reach_the_end_of_episodes():
+    """As with PPO: 20 calls of 4 timesteps see episodes of 29."""
+    model = clocks(29, n_steps=20)
+    for _ in range(20):
+        stop = While(lambda end=model.num_timesteps + 4: model.num_timesteps < end)
+        model.learn(100, stop, reset_num_timesteps=model.num_timesteps == 0)
+    assert model.num_timesteps == 80
+    assert [info["l"] for info in model.ep_info_buffer] == [29, 29]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_an_error_in_an_environment_resets_it_and_one_in_a_callback_does_not(error, monkeypatch):
+    def fails(*_):
+        raise error
+
+    model = trained(clocks(np.inf))
+    with pytest.raises(error):
+        model.learn(9, While(fails), reset_num_timesteps=False)
+    trained(model)
+    assert knows_the_time(model)
+    assert model.rollout_buffer._of_segments("time").max() == 6
+    with monkeypatch.context() as patch:
+        patch.setattr(Clock, "step", fails)
+        with pytest.raises(error):
+            trained(model)
+    trained(model)
+    assert knows_the_time(model)
+    assert model.rollout_buffer._of_segments("time").max() == 0
+
+
+@pytest.mark.parametrize("rollout", ["episodes", "timesteps"])
+def test_a_file_saved_in_mid_rollout_resets_environments_that_have_gone_on(rollout, tmp_path):
+    model = clocks(9, 9, rollout=rollout)
+
+    def saves():
+        if model.num_timesteps == 6:
+            model.save(tmp_path / "model")
+        return True
+
+    model.learn(20, While(saves))
+    loaded = CRPN.load(tmp_path / "model", env=model.env, force_reset=False)
+    trained(loaded)
+    assert knows_the_time(loaded)
+
+
+def test_a_discounted_visitation_of_an_endless_task_is_warned_of():
+    settings = {"discount_visitation": True, "gamma": 0.5, "n_steps": 10}
+    trained(clocks(np.inf, **settings))
+    with pytest.warns(UserWarning, match=r"less than 0.001.*discount_visitation=False"):
+        trained(clocks(np.inf, **settings), 2)
+
+
+def test_a_single_timestep_is_not_normalised():
+    with pytest.raises(ValueError, match=r"^CRPN: n_steps=1 is not allowed.*normalize_advantage"):
+        clocks(5, n_steps=1)
+    trained(clocks(5, n_steps=1, normalize_advantage=False))
+
+
+@pytest.mark.parametrize("kind", [int, dict, lambda: None])
+def test_a_rollout_has_to_be_made_by_a_tracker(kind):
+    with pytest.raises(ValueError, match=r"^CRPN: rollout=.* is not allowed.*a class of Tracker"):
+        clocks(5, rollout=kind)
 
 
 @pytest.mark.parametrize("early_resets", [True, False])
