@@ -22,6 +22,7 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_crpn import ACRPN, CRPN
+from sb3_crpn.checks import not_allowed
 from sb3_crpn.cli import parse
 from sb3_crpn.distributed import broadcast, init_from_env, rank, world_size
 
@@ -47,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     register()
     options = parsed.options
     if parsed.script == "train":
-        options = [*_default_config(options), *zoo_options(options)]
+        options = [*zoo_options(options), *_config(options)]
     sys.argv = ["sb3-crpn", parsed.script, *options]
     rl_zoo3.cli.main()
 
@@ -105,18 +106,37 @@ def config_file(name: str) -> Path:
 
     crpn and acrpn are the defaults of ``sb3-crpn train``, crpn_paper and acrpn_paper the paper's
     experiments; crpn_16_envs and crpn_64_envs are for so many environments.
+
+    Raises
+    ------
+    ValueError
+        There is no such file.
     """
     installed = Path(str(resources.files("sb3_crpn"))) / "zoo_configs"
     folder = installed if installed.is_dir() else installed.parents[1] / "zoo_configs"
-    return folder / f"{name}.yml"
+    files = {file.stem: file for file in sorted(folder.glob("*.yml"))}
+    if name not in files:
+        raise not_allowed("config_file: name", name, f"one of {', '.join(files)}")
+    return files[name]
 
 
-def _default_config(options: Sequence[str]) -> list[str]:
-    """Return the option that names our hyperparameters; a later one of the user's own wins."""
+def _config(options: Sequence[str]) -> list[str]:
+    """Return the option that names a file of ours, to stand after the ``options``.
+
+    It is the algorithm's where they name none, and that which ``--conf-file crpn_16_envs`` names,
+    with or without ``.yml``, where no file of the user's has this name.
+    """
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--algo")
-    algo = parser.parse_known_args(options)[0].algo
-    return ["--conf-file", str(config_file(algo))] if algo in ALGORITHMS else []
+    parser.add_argument("-conf", "--conf-file")
+    parsed = parser.parse_known_args(options)[0]
+    if parsed.conf_file is None:
+        return ["--conf-file", str(config_file(parsed.algo))] if parsed.algo in ALGORITHMS else []
+    try:
+        ours = config_file(parsed.conf_file.removesuffix(".yml"))
+    except ValueError:
+        return []
+    return [] if Path(parsed.conf_file).exists() else ["--conf-file", str(ours)]
 
 
 def sample_crpn_params(

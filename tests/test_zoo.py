@@ -11,7 +11,7 @@ import pytest
 import yaml
 from stable_baselines3.common.save_util import load_from_pkl
 
-from sb3_crpn.zoo import ALGORITHMS, _default_config, config_file, main
+from sb3_crpn.zoo import ALGORITHMS, _config, config_file, main
 
 ROOT = Path(__file__).parents[1]
 # Episodes of 200 steps: two environments take 400 to the update
@@ -220,11 +220,23 @@ def test_scripts_run_from_a_wheel(site, tmp_path):
         ("-n 5 --algo=acrpn", "acrpn"),
         ("--algo ppo", None),
         ("", None),
+        ("--algo crpn --conf-file crpn_16_envs.yml", "crpn_16_envs"),
+        ("--algo crpn -conf crpn_64_envs", "crpn_64_envs"),
+        ("--algo crpn --conf-file mine.yml", None),
+        (f"--algo crpn --conf-file {ROOT}/zoo_configs/crpn_64_envs.yml", None),
     ],
 )
 def test_our_algorithms_have_our_hyperparameters(options, name):
     expected = [] if name is None else ["--conf-file", str(ROOT / "zoo_configs" / f"{name}.yml")]
-    assert _default_config(options.split()) == expected
+    assert _config(options.split()) == expected
+
+
+def test_a_file_of_the_users_goes_before_ours_of_the_same_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("crpn_16_envs.yml").write_text("")
+    assert _config(["--algo", "crpn", "--conf-file", "crpn_16_envs.yml"]) == []
+    with pytest.raises(ValueError, match=r"'crpn_8_envs' is not allowed.*crpn_16_envs"):
+        config_file("crpn_8_envs")
 
 
 def test_without_rl_zoo3_one_line_says_what_to_install(monkeypatch):

@@ -287,10 +287,12 @@ class PolicyNewtonSettings:
         "max_grad_norm": "gradients are not clipped; target_kl, or else alpha, bounds the step",
         "rms_prop_eps": "use policy_kwargs=dict(optimizer_kwargs=...), the critic's optimiser",
         "use_rms_prop": "use policy_kwargs=dict(optimizer_class=...), the critic's optimiser",
+        "normalize": "rl-zoo's: wrap the environment in VecNormalize",
+        "n_timesteps": "pass it to learn",
         "cg_max_steps": "use krylov_dim",
         "cg_damping": "use fisher_damping",
         "line_search_shrinking_factor": "there is no line search; alpha is fitted to target_kl",
         "line_search_max_iter": "there is no line search; alpha is fitted to target_kl",
         "sub_sampling_factor": "use n_hessian_episodes, fewer than n_episodes",
     }
-    """What stands in the place of arguments of SB3's PPO and A2C and sb3-contrib's TRPO."""
+    """What stands in the place of arguments of SB3's PPO and A2C, sb3-contrib's TRPO and rl-zoo."""

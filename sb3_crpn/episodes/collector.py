@@ -271,8 +271,9 @@ class Collector:
         if without_end >= self._endless_after:
             raise ValueError(
                 f"no episode ended within {without_end} steps, but whole episodes are asked for: "
-                "pass horizon=H to cut them after H steps, or wrap the environment in "
-                'gymnasium.wrappers.TimeLimit; training alone can do with rollout="timesteps"'
+                "give CRPN or ACRPN horizon=H to cut them after H steps, or wrap the environment "
+                "in gymnasium.wrappers.TimeLimit; training alone can do with "
+                'rollout="timesteps"'
             )
 
 
