@@ -39,7 +39,7 @@ LAYERS = {
     "theory": {"checks"},
     "callbacks": {"checks", "algorithm"},
     "__init__": {"crpn", "acrpn", "sosp", "theory", "callbacks"},
-    "zoo": {"cli", "distributed", "crpn", "acrpn", "__init__"},
+    "zoo": {"checks", "cli", "distributed", "crpn", "acrpn", "__init__"},
     "__main__": {"cli", "zoo"},
 }
 ARRAYS = {"numpy", "scipy", "torch"}

@@ -159,8 +159,10 @@ def resolve(
 
 def changes_for(env_id: str, n_envs: int) -> dict[str, Any]:
     """Return what CRPN's entry for so many environments changes in its usual one; {} without."""
-    path = zoo.config_file(f"crpn_{n_envs}_envs")
-    entry = _load(path).get(env_id, {}) if path.is_file() else {}
+    try:
+        entry = _load(zoo.config_file(f"crpn_{n_envs}_envs")).get(env_id, {})
+    except ValueError:  # there is no such file
+        return {}
     usual = resolve("CRPN", env_id, {})[1]
     return {key: value for key, value in entry.items() if usual.get(key) != value}
 
