@@ -153,8 +153,9 @@ def ranks() -> str:
 
 
 def compared_rollouts() -> str:
-    """Return what whole episodes and timesteps reach, at equal settings."""
-    return rollouts.table(store.read_runs(rollouts.RESULTS))
+    """Return by how much whole episodes and timesteps differ, and what each reaches."""
+    runs = store.read_runs(rollouts.RESULTS)
+    return f"{rollouts.differences(runs)}\n\n{rollouts.table(runs)}"
 
 
 def many_environments() -> str:

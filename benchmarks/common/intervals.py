@@ -61,6 +61,11 @@ def interval(
     return Estimate(value, float(bounds.low), float(bounds.high))
 
 
+def difference_of_means(first: Sequence[float], second: Sequence[float]) -> float:
+    """Return mean(first) - mean(second)."""
+    return float(np.mean(first) - np.mean(second))
+
+
 def ratio_of_medians(first: Sequence[float], second: Sequence[float]) -> float:
     """Return median(first) / median(second)."""
     return float(np.median(first) / np.median(second))

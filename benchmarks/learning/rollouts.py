@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from benchmarks.common.intervals import interval
+from benchmarks.common.intervals import difference_of_means, interval
 from benchmarks.common.markdown import estimate, markdown
 from benchmarks.common.pool import run_all
 from benchmarks.learning import store
@@ -74,7 +74,8 @@ def main() -> None:
         keep = partial(store.append, args.results)
         if missing and run_all(execute, missing, keep, n_processes=args.jobs):
             sys.exit(1)
-    print(table(store.read_runs(args.results)))
+    found = store.read_runs(args.results)
+    print(f"{differences(found)}\n\n{table(found)}")
 
 
 def wanted_runs() -> list[Run]:
@@ -102,12 +103,6 @@ def table(runs: pd.DataFrame) -> str:
     """Return means over seeds with 95 % intervals: one line an environment and setting."""
     head = ["environment", "timesteps", "environments", "rollout", "other changes", "seeds",
             "mean over training", "final", "episodes", "CPU s"]  # fmt: skip
-    settings = runs["setting"].map(parse_setting)
-    size = settings.map(lambda setting: setting.get("n_envs", "entry's"))
-    rollout = settings.map(lambda setting: setting.get("rollout", "episodes"))
-    others = settings.map(_other_changes)
-    keys = [runs["env"], runs["timesteps"], size.rename("n_envs"), rollout.rename("rollout"),
-            others.rename("others")]  # fmt: skip
     body = [
         [
             *key,
@@ -117,9 +112,37 @@ def table(runs: pd.DataFrame) -> str:
             f"{group['episodes'].mean():.0f}",
             f"{group['cpu_seconds'].mean():.0f}",
         ]
-        for key, group in runs.groupby(keys, sort=True)
+        for key, group in runs.groupby(_keys(runs), sort=True)
     ]
     return markdown(head, body)
+
+
+def differences(runs: pd.DataFrame) -> str:
+    """Return the return of timesteps less that of episodes, where both have two seeds or more."""
+    head = ["environment", "timesteps", "environments", "seeds", "mean over training", "final"]
+    size, rollout = _keys(runs)[2:4]
+    body = []
+    for key, group in runs.groupby([runs["env"], runs["timesteps"], size], sort=True):
+        arms = [group[rollout[group.index] == name] for name in reversed(ROLLOUTS)]
+        n_seeds = min(len(arm) for arm in arms)
+        if n_seeds < 2:
+            continue
+        found = (
+            interval(*(arm[column] for arm in arms), statistic=difference_of_means)
+            for column in ("mean_return", "final_return")
+        )
+        body.append([*key, n_seeds, *(estimate(each, "+,.0f") for each in found)])
+    return markdown(head, body)
+
+
+def _keys(runs: pd.DataFrame) -> list[pd.Series]:
+    """Return environment, timesteps, number of environments, rollout and what else changes."""
+    settings = runs["setting"].map(parse_setting)
+    size = settings.map(lambda setting: setting.get("n_envs", "entry's"))
+    rollout = settings.map(lambda setting: setting.get("rollout", "episodes"))
+    others = settings.map(_other_changes)
+    return [runs["env"], runs["timesteps"], size.rename("n_envs"), rollout.rename("rollout"),
+            others.rename("others")]  # fmt: skip
 
 
 def _other_changes(setting: dict[str, Any]) -> str:

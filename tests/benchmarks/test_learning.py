@@ -218,6 +218,23 @@ def test_the_table_of_rollouts() -> None:
     ]
 
 
+def test_the_differences_of_rollouts() -> None:
+    settings = ["", "", "rollout=timesteps", "rollout=timesteps", "n_envs=16,rollout=timesteps"]
+    returns = [10.0, 10.0, 30.0, 30.0, 5.0]
+    runs = pd.DataFrame(
+        {
+            "env": "CartPole-v1",
+            "timesteps": 100,
+            "setting": settings,
+            "mean_return": returns,
+            "final_return": [-each for each in returns],
+        }
+    )
+    assert rollouts.differences(runs).splitlines()[2:] == [
+        "| CartPole-v1 | 100 | entry's | 2 | +20 [+20, +20] | -20 [-20, -20] |"
+    ]
+
+
 def test_a_new_argument_does_not_make_another_run_but_another_value_does() -> None:
     assert same_hyperparameters("a=1; b=2", "a=1; b=2; c=3")
     assert not same_hyperparameters("a=1; b=2", "a=1; b=3")

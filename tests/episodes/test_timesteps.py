@@ -160,16 +160,17 @@ def test_an_error_in_an_environment_resets_it_and_one_in_a_callback_does_not(err
 
 @pytest.mark.parametrize("rollout", ["episodes", "timesteps"])
 def test_a_file_saved_in_mid_rollout_resets_environments_that_have_gone_on(rollout, tmp_path):
-    model = clocks(9, 9, rollout=rollout)
+    model = trained(clocks(9, 9, rollout=rollout))
+    start = model.num_timesteps
 
     def saves():
-        if model.num_timesteps == 6:
+        if model.num_timesteps == start + 6:
             model.save(tmp_path / "model")
-        return True
+        return model.num_timesteps < start + 12
 
-    model.learn(20, While(saves))
+    model.learn(20, While(saves), reset_num_timesteps=False)
     loaded = CRPN.load(tmp_path / "model", env=model.env, force_reset=False)
-    trained(loaded)
+    loaded.learn(1, reset_num_timesteps=False)  # one rollout
     assert knows_the_time(loaded)
 
 
@@ -180,7 +181,7 @@ def test_a_discounted_visitation_of_an_endless_task_is_warned_of():
         trained(clocks(np.inf, **settings), 2)
 
 
-def test_a_single_timestep_is_not_normalised():
+def test_a_single_timestep_cannot_be_normalised():
     with pytest.raises(ValueError, match=r"^CRPN: n_steps=1 is not allowed.*normalize_advantage"):
         clocks(5, n_steps=1)
     trained(clocks(5, n_steps=1, normalize_advantage=False))
