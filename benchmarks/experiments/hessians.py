@@ -1,4 +1,4 @@
-"""CRPN with H from other episodes, or with the share of H that held-out episodes confirm."""
+"""CRPN with H from other episodes, or as far as held-out episodes confirm it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from gymnasium import Env
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
@@ -18,9 +19,11 @@ from benchmarks.experiments.steps import step_of_kl
 from sb3_crpn import CRPN
 from sb3_crpn.algorithm.update import UpdateData
 from sb3_crpn.curvature import CurvatureEstimate
-from sb3_crpn.episodes import EpisodeBatch
+from sb3_crpn.episodes import EpisodeBatch, Replay, concatenate
 
 MAX_ORACLE_ENVS = 16
+# Previous rollouts in the H of `MemoryHessian`
+N_REMEMBERED = 8
 # Candidates of ω
 OMEGAS = (0.0, 0.25, 0.5, 0.75, 1.0)
 MEMORY = 0.9  # by which the values of the past fade in an update
@@ -63,6 +66,29 @@ class OracleHessian(FreshHessian):
     def _hessian_batch(self, batch: EpisodeBatch) -> EpisodeBatch:
         n_episodes = self.factor * batch.n_episodes
         return self._batch(self.rollouts.evaluate(self, n_episodes, self._oracle_env))
+
+
+class LongReplay(Replay):
+    """Replay that keeps a rollout until its effective sample size is a tenth of its steps."""
+
+    min_effective_size = 0.1
+
+
+class MemoryHessian(CRPN):
+    """H from the new rollout and up to ``N_REMEMBERED`` previous ones, g as in CRPN."""
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        self._memory = LongReplay(N_REMEMBERED, self.gamma, self.gae_lambda)
+        return super()._setup_learn(*args, **kwargs)
+
+    def _estimate(self, data: UpdateData) -> CurvatureEstimate:
+        remembered = self._memory.reweighted(self.policy, **self._weighting)
+        self._memory.append(data.fresh)
+        return self._estimate_from(
+            data.joined,
+            hessian_batch=concatenate([data.fresh, *remembered]),
+            fisher_batch=data.fresh,
+        )
 
 
 class ConfirmedHessian(CRPN):

@@ -18,10 +18,6 @@ from sb3_crpn.policy import values_and_log_probs
 # ρ̄, where importance ratios are truncated (Ionides, Truncated importance sampling, 2008): bounds
 # their variance, and leaves untouched what a few steps of the usual target_kl do to most actions
 MAX_RATIO = 2.0
-# Effective sample size, relative to the rollout's size, below which a rollout is dropped: where
-# sequential Monte Carlo resamples (Liu and Chen, Blind deconvolution via sequential imputations,
-# JASA 1995)
-MIN_EFFECTIVE_SIZE = 0.5
 
 
 class Replay:
@@ -45,7 +41,16 @@ class Replay:
         Maximum number of rollouts.
     gamma, gae_lambda
         γ and λ.
+
+    Attributes
+    ----------
+    min_effective_size
+        Effective sample size, relative to the rollout's size, below which a rollout is dropped:
+        0.5, where sequential Monte Carlo resamples (Liu and Chen, Blind deconvolution via
+        sequential imputations, JASA 1995).
     """
+
+    min_effective_size = 0.5
 
     def __init__(self, size: int, gamma: float, gae_lambda: float) -> None:
         self._batches: deque[EpisodeBatch] = deque(maxlen=size)
@@ -67,12 +72,20 @@ class Replay:
         normalised by itself, as it was when it was fresh.
         """
         seen = [(batch, *_evaluate(policy, batch)) for batch in self._batches]
-        usable = [entry for entry in seen if _is_alike(entry[0], entry[-1])]
+        usable = [entry for entry in seen if self._is_alike(entry[0], entry[-1])]
         self._batches = deque((entry[0] for entry in usable), self._batches.maxlen)
         return [
             self._reweight(batch, values, terminal_values, ratios, **weighting)
             for batch, values, terminal_values, ratios in usable
         ]
+
+    def _is_alike(self, batch: EpisodeBatch, ratios: FloatArray) -> bool:
+        """Return whether the effective sample size, over all ranks, is large enough."""
+        with np.errstate(over="ignore"):
+            sums = [len(ratios), ratios.sum(), (ratios**2).sum()]
+        size, total, squares = batch.total(torch.tensor(sums, dtype=torch.float64)).tolist()
+        least = self.min_effective_size * size
+        return bool(total**2 > least * squares)  # false where a sum is infinite
 
     def _reweight(
         self,
@@ -125,11 +138,3 @@ def _evaluate(
         ratios: FloatArray = np.exp(np.concatenate(log_probs) - batch.log_probs)
     terminal_values = bootstrap_values(policy, batch.next_observations, batch.bootstrapped)
     return np.concatenate(values), terminal_values, ratios
-
-
-def _is_alike(batch: EpisodeBatch, ratios: FloatArray) -> bool:
-    """Tell whether the effective sample size, over all ranks, is at least half of the steps."""
-    with np.errstate(over="ignore"):
-        sums = [len(ratios), ratios.sum(), (ratios**2).sum()]
-    size, total, squares = batch.total(torch.tensor(sums, dtype=torch.float64)).tolist()
-    return bool(total**2 > MIN_EFFECTIVE_SIZE * size * squares)  # false where a sum is infinite

@@ -10,7 +10,7 @@ from sb3_crpn.episodes import Replay
 from sb3_crpn.episodes import batch as episode_batch
 from sb3_crpn.episodes.advantages import cost_advantages, generalized_advantages
 from sb3_crpn.episodes.buffer import CHUNK
-from sb3_crpn.episodes.replay import MAX_RATIO, MIN_EFFECTIVE_SIZE
+from sb3_crpn.episodes.replay import MAX_RATIO
 from tests.policies import frozen_episodes, small_policy
 
 GAMMA, GAE_LAMBDA = 0.9, 0.8
@@ -170,7 +170,7 @@ def test_a_rollout_is_forgotten_for_good_once_its_effective_size_is_less_than_ha
     with np.errstate(over="ignore", invalid="ignore"):
         ratios = np.exp(evaluated(policy, batch)[1] - batch.log_probs)
         effective = ratios.sum() ** 2 / (ratios**2).sum() / batch.n_steps  # nan for 0 / 0
-    alike = bool(effective > MIN_EFFECTIVE_SIZE)
+    alike = bool(effective > Replay.min_effective_size)
     assert alike == (change == 0.1)
     assert bool(earlier.reweighted(policy, **RAW)) == alike
     with torch.no_grad():

@@ -23,13 +23,19 @@ from benchmarks.experiments.confirmed import (
     secant_curvature,
 )
 from benchmarks.experiments.crossfit import CrossFit, confirm_natural_step
-from benchmarks.experiments.hessians import ConfirmedHessian, FreshHessian, OracleHessian
+from benchmarks.experiments.hessians import (
+    ConfirmedHessian,
+    FreshHessian,
+    MemoryHessian,
+    OracleHessian,
+)
 from benchmarks.experiments.steps import Subspace, fisher_subspace, parabola_kl, step_of_kl
 from benchmarks.learning.store import RESULTS, read_curves
 from sb3_crpn import CRPN, PAPER
 from sb3_crpn.algorithm.update import UpdateData
 from sb3_crpn.curvature import Causal
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives
+from sb3_crpn.episodes import concatenate
 from sb3_crpn.vec_env import GymnasiumVecEnv
 
 KAPPA = 0.9
@@ -221,6 +227,20 @@ def test_the_fresh_hessian_forgets_earlier_rollouts_and_the_gradient_does_not():
     assert not torch.allclose(estimate.gradient, alone.gradient)
 
 
+def test_the_memory_has_rollouts_that_the_gradient_has_not():
+    model = make_learner(MemoryHessian, n_reused_rollouts=1)
+    model.learn(MDP.horizon * 8 * 4)
+    _, _, third, last = model._memory._batches
+    remembered = model._memory.reweighted(model.policy, **model._weighting)
+    joined = model._estimate_from(concatenate([last, *remembered]))
+    estimate = model._estimate(UpdateData(last, [third]))
+    direction = torch.ones(len(THETA), dtype=torch.float64)
+    assert torch.allclose(estimate.hessian @ direction, joined.hessian @ direction)
+    assert estimate.gradient_batch.n_episodes == last.n_episodes + third.n_episodes
+    model.learn(MDP.horizon * 8)
+    assert len(model._memory._batches) == 1
+
+
 def test_a_choice_of_the_hessian_has_the_value_of_its_step():
     space, g, H = exact_model()
     model = make_learner(ConfirmedHessian, n_envs=100, target_kl=0.1)
@@ -242,10 +262,10 @@ def test_what_one_episode_says_of_the_hessian_is_not_believed():
 
 
 def test_runs_of_the_oracle_study_differ_in_the_hessian_alone(monkeypatch):
-    monkeypatch.setattr(oracle, "BUDGETS", {"CartPole-v1": 1200})
+    monkeypatch.setattr(oracle, "TASKS", {"CartPole-v1": oracle.Task(1200)})
     returns = {
         hessian: oracle.measure("CartPole-v1", 0.02, hessian, 0)[0]["mean_return"]
-        for hessian in ("none", "1", "confirmed")
+        for hessian in ("none", "4", "memory", "confirmed")
     }
     assert all(10 < value < 100 for value in returns.values())
     assert len(set(returns.values())) > 1
