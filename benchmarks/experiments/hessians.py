@@ -138,9 +138,10 @@ class ConfirmedHessian(CRPN):
             groups = slice(None) if source == "all" else slice(folds.n_folds)
             rest = (forms[groups].sum(0) - forms[k]) / (folds.sizes[groups].sum() - folds.sizes[k])
             y = step_of_kl(fold.gradient, omega * rest, fold.space, self.target_kl)
-            values[source, omega] = _gain(fold.test_gradient, test, y)
+            values[source, omega] = step_value(fold.test_gradient, test, y)
         return values
 
 
-def _gain(gradient: Tensor, hessian: Tensor, y: Tensor) -> float:
+def step_value(gradient: Tensor, hessian: Tensor, y: Tensor) -> float:
+    """Return -(g·y + ½ yᵀHy), the decrease of the cost to second order."""
     return -float(gradient @ y + 0.5 * torch.dot(y, hessian @ y))

@@ -36,6 +36,15 @@ class Subspace:
         """Return √(sᵀFs), of which half the square is the KL divergence."""
         return float((self.fisher * y**2).sum().sqrt())
 
+    def redamped(self, damping: float, other: float) -> tuple[Subspace, Tensor]:
+        """Return the space in the coordinates of ε = ``other`` in place of ε = ``damping``.
+
+        And the factors, [k], that a gradient's coordinates, and both sides of a Hessian's, take.
+        """
+        eigenvalues = damping * self.fisher / (1.0 - self.fisher)
+        factors = ((eigenvalues + damping) / (eigenvalues + other)).sqrt()
+        return Subspace(self.basis * factors, eigenvalues / (eigenvalues + other)), factors
+
 
 def n_steps(groups: Sequence[EpisodeDerivatives]) -> Tensor:
     """Return the steps of each group, float64 [K]."""
