@@ -30,9 +30,16 @@ from sb3_crpn.curvature import CurvatureEstimate, GroupedOperator
 
 BUDGET = 100_000
 FIRST_SEED = 10
-ENVS = ("Hopper-v5", "Swimmer-v5")
-N_REUSED = (3, 0)
 WEIGHTS = (1.0, 8.0)
+# Environments and their reused rollouts: the entries', then those that the entries go without
+CASES = (
+    ("Hopper-v5", 0),
+    ("Swimmer-v5", 0),
+    ("HalfCheetah-v5", 3),
+    ("Walker2d-v5", 0),
+    ("Hopper-v5", 3),
+    ("Swimmer-v5", 3),
+)
 
 
 class WeightedNoise(CRPN):
@@ -65,10 +72,10 @@ def plus_diagonal(operator: GroupedOperator, diagonal: torch.Tensor) -> GroupedO
 
 def jobs(seeds: int) -> list[Row]:
     """Return one job per training run."""
-    cases = itertools.product(range(FIRST_SEED, FIRST_SEED + seeds), ENVS, N_REUSED, WEIGHTS)
+    cases = itertools.product(range(FIRST_SEED, FIRST_SEED + seeds), CASES, WEIGHTS)
     return [
         {"env": env, "n_reused_rollouts": n, "weight": weight, "seed": seed}
-        for seed, env, n, weight in cases
+        for seed, (env, n), weight in cases
     ]
 
 
@@ -93,19 +100,18 @@ def table(rows: pd.DataFrame) -> str:
 
 
 def draw(rows: pd.DataFrame) -> Figure:
-    """Draw the mean returns against c, a panel a task; print the table."""
+    """Draw the mean returns against c, a panel a case; print the table."""
     print(table(rows))
-    figure, axes = plt.subplots(1, len(ENVS), figsize=(9, 3), layout="constrained")
-    for axis, env in zip(axes, ENVS, strict=True):
-        for colour, n in zip(PALETTE, N_REUSED, strict=False):
-            runs = rows[(rows.env == env) & (rows.n_reused_rollouts == n)]
-            means = runs.groupby("weight").mean_return.mean()
-            axis.plot(runs.weight, runs.mean_return, ".", color=colour, alpha=0.4)
-            axis.plot(means.index, means, "o-", color=colour, label=f"{n} reused rollouts")
+    figure, axes = plt.subplots(2, 3, figsize=(9, 5), layout="constrained")
+    for axis, (env, n) in zip(axes.flat, CASES, strict=True):
+        runs = rows[(rows.env == env) & (rows.n_reused_rollouts == n)]
+        for _, run in runs.groupby("seed"):
+            axis.plot(run.weight, run.mean_return, ".-", color=PALETTE[0], alpha=0.3)
+        means = runs.groupby("weight").mean_return.mean()
+        axis.plot(means.index, means, "o-", color=PALETTE[0])
         axis.set(xscale="log", xlabel="c")
-        axis.set_title(env, fontsize=9)
-    axes[0].set_ylabel("mean return over training")
-    axes[0].legend(fontsize=7)
+        axis.set_title(f"{env}, {n} reused rollouts", fontsize=9)
+    axes[0, 0].set_ylabel("mean return over training")
     return figure
 
 
