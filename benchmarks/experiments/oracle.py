@@ -8,6 +8,7 @@ times it, where a second order should matter more. The Hessian of each update is
 - ``none``: left out; ``own``: from the update's episodes, earlier rollouts included, as CRPN does;
 - ``fresh``: from the fresh rollout alone;
 - ``memory``: from the fresh rollout and eight previous ones;
+- ``critic``: as ``own``, with the critic of :mod:`~benchmarks.experiments.critic_hessian`;
 - ``confirmed``: shrunk, and with earlier rollouts or without, by the value on held-out episodes;
 - ``4``, ``16``: from as many times the rollout's episodes, fresh and independent, which are not
   counted as training: an oracle.
@@ -30,6 +31,7 @@ from benchmarks.common.figures import PALETTE
 from benchmarks.common.intervals import interval
 from benchmarks.common.markdown import estimate, markdown
 from benchmarks.common.table import Row
+from benchmarks.experiments.critic_hessian import CriticHessian
 from benchmarks.experiments.hessians import (
     ConfirmedHessian,
     FreshHessian,
@@ -45,6 +47,7 @@ ALGORITHMS: dict[str, type[CRPN]] = {
     "own": CRPN,
     "fresh": FreshHessian,
     "memory": MemoryHessian,
+    "critic": CriticHessian,
     "confirmed": ConfirmedHessian,
 }
 FACTORS = ("4", "16")
