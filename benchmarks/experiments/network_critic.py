@@ -53,6 +53,7 @@ N_BATCHES = 24
 N_SPACE = 6  # batches that make the Krylov space
 DIM = 10  # of it, CRPN's default
 FIRST_SEED = 10
+ERRORS = ("error", "scaled")  # of H, and of the best ωH
 
 
 class Task(NamedTuple):
@@ -170,16 +171,15 @@ def with_errors(rows: pd.DataFrame, more: int = 1) -> pd.DataFrame:
 
 
 def settings_table(rows: pd.DataFrame) -> str:
-    """Return a Markdown table: error of H, of the best ωH, and bias; means over checkpoints."""
-    found = with_errors(rows).groupby(["fit", "kappa", "trace", "env"])
-    means = found[["error", "scaled", "bias"]].mean()
+    """Return a Markdown table: error of H, of the best ωH, and bias, a column a checkpoint."""
+    found = _by_checkpoint(with_errors(rows))
     body = []
-    for (fit, kappa, trace), group in means.groupby(level=["fit", "kappa", "trace"]):
-        cells = group.droplevel([0, 1, 2]).reindex(list(TASKS)).to_dict("records")
-        texts = ["{error:.2f}; {scaled:.2f}; {bias:.2f}".format(**cell) for cell in cells]
+    for (fit, kappa, trace), group in found.groupby(["fit", "kappa", "trace"]):
+        cells = group.set_index("checkpoint").reindex(found.checkpoint.unique())
+        texts = [f"{cell.error:.2f}; {cell.scaled:.2f}; {cell.bias:.2f}" for cell in cells.iloc]
         critic = [f"{fit} ×", f"{trace:g}"] if fit else ["none", "-"]
         body.append([critic[0], f"{kappa:g}", critic[1], *texts])
-    return markdown(["critic", "κ", "λ_H", *TASKS], body)
+    return markdown(["critic", "κ", "λ_H", *found.checkpoint.unique()], body)
 
 
 def best_table(rows: pd.DataFrame) -> str:
@@ -188,46 +188,53 @@ def best_table(rows: pd.DataFrame) -> str:
     Without a critic H has them.
     """
     body = []
-    for env, group in rows.groupby("env", sort=False):
+    for checkpoint, group in _by_checkpoint(rows).groupby("checkpoint", sort=False):
         plain = group[group.fit == 0]
         cells = [_best(with_errors(plain, more), "kappa") for more in (1, *(1 + k for k in FITS))]
         cells += [_best(with_errors(group[group.fit == fit]), "trace") for fit in FITS]
-        body.append([env, group.seed.nunique(), *cells])
+        body.append([checkpoint, *cells])
     multiples = (f"best κ, {1 + fit} × episodes" for fit in FITS)
     critics = (f"critic, {fit} ×" for fit in FITS)
-    return markdown(["task", "checkpoints", "best κ", *multiples, *critics], body)
+    return markdown(["checkpoint", "best κ", *multiples, *critics], body)
+
+
+def _by_checkpoint(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows with their checkpoint's name, in the order of ``TASKS``."""
+    named = rows.assign(checkpoint=rows.env + ", " + rows.seed.astype(str))
+    order = [named[named.env == env].sort_values("seed", kind="stable") for env in TASKS]
+    return pd.concat(order)
 
 
 def _best(rows: pd.DataFrame, setting: str) -> str:
-    """Return the lowest means of both errors over checkpoints, and their κ or λ_H."""
-    means = rows.groupby(setting)[["error", "scaled"]].mean()
-    lowest = (f"{means[column].min():.2f} ({means[column].idxmin():g})" for column in means)
+    """Return the lowest of both errors, and their κ or λ_H."""
+    found = rows.set_index(setting)
+    lowest = (f"{found[column].min():.2f} ({found[column].idxmin():g})" for column in ERRORS)
     return "; ".join(lowest)
 
 
 def draw(rows: pd.DataFrame) -> Figure:
-    """Draw the errors, a panel a task; print the tables."""
+    """Draw the errors, a panel a checkpoint; print the tables."""
     print(settings_table(rows), best_table(rows), sep="\n\n")
-    envs = list(rows.env.unique())
-    size = (3 * len(envs), 3.2)
-    figure, axes = plt.subplots(1, len(envs), figsize=size, layout="constrained", squeeze=False)
-    for axis, env in zip(axes[0], envs, strict=True):
-        _draw(axis, with_errors(rows[rows.env == env]))
-        axis.set(xlabel=r"$\kappa\lambda_H$; without a critic κ", yscale="log", ylim=(0.25, 4.0))
-        axis.set_yticks((0.3, 0.5, 1, 2, 4), ("0.3", "0.5", "1", "2", "4"))
+    groups = list(_by_checkpoint(with_errors(rows)).groupby("checkpoint", sort=False))
+    size = (2.3 * len(groups), 3.2)
+    figure, axes = plt.subplots(1, len(groups), figsize=size, layout="constrained", squeeze=False)
+    for axis, (checkpoint, group) in zip(axes[0], groups, strict=True):
+        _draw(axis, group)
+        axis.set(xlabel=r"$\kappa\lambda_H$; without a critic κ", yscale="log", ylim=(0.2, 8.0))
+        axis.set_yticks((0.2, 0.5, 1, 2, 4, 8), ("0.2", "0.5", "1", "2", "4", "8"))
         axis.minorticks_off()
-        axis.set_title(env, fontsize=9)
+        axis.set_title(checkpoint, fontsize=9)
     axes[0, 0].set_ylabel("error of $H$, of the best $ωH$ dashed")
-    axes[0, 0].legend(fontsize=7)
+    axes[0, 0].legend(fontsize=7, loc="upper left")
     return figure
 
 
 def _draw(axis: Axes, rows: pd.DataFrame) -> None:
     for colour, (fit, group) in zip(PALETTE, rows.groupby("fit"), strict=False):
-        means = group.assign(decay=group.kappa * group.trace).groupby("decay").mean("numeric_only")
+        decays = group.kappa * group.trace
         label = f"critic, {fit} ×" if fit else "no critic"
-        axis.plot(means.index, means.error, "o-", ms=3, color=colour, label=label)
-        axis.plot(means.index, means.scaled, "o--", ms=3, mfc="none", color=colour)
+        axis.plot(decays, group.error, "o-", ms=3, color=colour, label=label)
+        axis.plot(decays, group.scaled, "o--", ms=3, mfc="none", color=colour)
     axis.axhline(1.0, color="black", lw=0.6, ls=":")
 
 
