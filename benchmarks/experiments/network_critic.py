@@ -123,8 +123,7 @@ def _forms(batches: list[ProjectedSteps], kappa: float, trace: float, fit: int) 
     """Return each batch's H, a mean over steps, as a vector, [K, n²]."""
     forms = []
     for batch, used in zip(batches, uses(len(batches), fit), strict=True):
-        others = [other for other, is_in in zip(batches, used, strict=True) if is_in]
-        others = [other for other in others if other is not batch]
+        others = [batches[j] for j in np.flatnonzero(used) if batches[j] is not batch]
         critic = fit_critic(others, kappa) if others else None
         forms.append(batch.form(kappa, trace, critic).numpy() / batch.lengths.sum())
     return np.array(forms).reshape(len(batches), -1)
