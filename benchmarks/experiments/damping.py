@@ -35,7 +35,6 @@ BUDGETS = {
     "CartPole-v1": 20_000,
     "Acrobot-v1": 30_000,
     "Pendulum-v1": 30_000,
-    "HalfCheetah-v5": 100_000,
 }
 DAMPINGS = (0.03, 0.1, 0.3, 1.0, 3.0)
 ARMS = ("0.1", "1", "3", "chosen")
