@@ -115,7 +115,7 @@ def draw(rows: pd.DataFrame) -> Figure:
     return figure
 
 
-STUDY = Study("action_noise", jobs, measure, draw, seeds=3)
+STUDY = Study("action_noise", jobs, measure, draw, seeds=2)
 
 if __name__ == "__main__":
     STUDY.main(str(__doc__))

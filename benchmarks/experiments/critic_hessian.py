@@ -19,6 +19,7 @@ import torch
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from torch import Tensor
 
+from benchmarks.experiments.cross_time import next_values
 from sb3_crpn import CRPN
 from sb3_crpn.algorithm.update import UpdateData
 from sb3_crpn.arrays import FloatArray, IntArray, Observations
@@ -68,24 +69,18 @@ class ProjectedSteps:
         ahead = np.zeros_like(errors)
         if critic is not None:
             values = self.features @ critic.values
-            following = kappa * self.following(values)
+            following = kappa * next_values(values, self.lengths)
             errors = errors + following - values
             ahead = following - self.features @ critic.baseline
         later = episode_scan(errors, kappa * trace, self.lengths, reverse=True) - errors
         crossed = self.scores.T @ (later + ahead)
         return torch.from_numpy(self.at_once + crossed + crossed.T)
 
-    def following(self, values: FloatArray) -> FloatArray:
-        """Return the value of the next step, 0 after the last step of an episode, [T, m]."""
-        following = np.roll(values, -1, axis=0)
-        following[np.cumsum(self.lengths) - 1] = 0.0
-        return following
-
 
 def fit_critic(parts: Sequence[ProjectedSteps], kappa: float, ridge: float = RIDGE) -> LinearCritic:
     """Return the critic of ridge LSTD on all steps of ``parts``."""
     phi = np.concatenate([part.features for part in parts])
-    following = np.concatenate([part.following(part.features) for part in parts])
+    following = np.concatenate([next_values(part.features, part.lengths) for part in parts])
     rewards = np.concatenate([part.rewards for part in parts])
     squares, totals = phi.T @ phi, phi.T @ rewards
     damping = ridge * np.diag(squares).mean() * np.eye(len(squares))

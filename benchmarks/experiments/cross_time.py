@@ -117,7 +117,7 @@ class Steps:
         """Return the critic of LSTD, 0 for states that were not visited."""
         features = np.eye(n_states)[self.states]
         totals = features.T @ self.rewards
-        differences = features - kappa * self._following(features)
+        differences = features - kappa * next_values(features, self.lengths)
         values = np.linalg.pinv(features.T @ differences) @ totals
         visits = np.maximum(features.sum(0), 1.0)[:, None]
         return Critic(values, values - totals / visits)
@@ -125,7 +125,7 @@ class Steps:
     def returns(self, kappa: float, trace: float, n_states: int) -> FloatArray:
         """Return Ĝ_i as multiples of a critic's (I, b, -c), [T, d + 2S]."""
         present = np.eye(n_states)[self.states]
-        following = kappa * self._following(present)
+        following = kappa * next_values(present, self.lengths)
         errors = np.append(self.rewards, following - present, axis=1)
         later = episode_scan(errors, kappa * trace, self.lengths, reverse=True) - errors
         later[:, -n_states:] += following
@@ -137,11 +137,12 @@ class Steps:
         crossed: FloatArray = np.add.reduceat(pairs, episode_starts(self.lengths))
         return crossed
 
-    def _following(self, values: FloatArray) -> FloatArray:
-        """Return the value of the next step, 0 after the last step of an episode, [T, k]."""
-        following = np.roll(values, -1, axis=0)
-        following[np.cumsum(self.lengths) - 1] = 0.0
-        return following
+
+def next_values(values: FloatArray, lengths: IntArray) -> FloatArray:
+    """Return the value of the next step, 0 after the last step of an episode, [T, k]."""
+    following = np.roll(values, -1, axis=0)
+    following[np.cumsum(lengths) - 1] = 0.0
+    return following
 
 
 def hessians(steps: Steps, crossed: FloatArray, critic: Critic) -> FloatArray:

@@ -23,7 +23,7 @@ from benchmarks.common.intervals import interval
 from benchmarks.common.markdown import estimate, markdown
 from benchmarks.common.table import Row
 from benchmarks.experiments.crossfit import CrossFit, Fold
-from benchmarks.experiments.hessians import MEMORY, step_value
+from benchmarks.experiments.hessians import remember, step_value
 from benchmarks.experiments.steps import step_of_kl
 from benchmarks.experiments.study import Study
 from benchmarks.experiments.tasks import Returns, make_model
@@ -56,16 +56,17 @@ class ChosenDamping(CRPN):
 
     def _estimate(self, data: UpdateData) -> CurvatureEstimate:
         if data.fresh.n_episodes > 1:
-            folds = CrossFit(self, data.fresh, data.earlier)
-            self._judge([(fold.weight, self._fold_values(folds, fold)) for fold in folds])
+            self._judge(CrossFit(self, data.fresh, data.earlier))
+            self.fisher_damping = max(self.values, key=self.values.__getitem__)
         return super()._estimate(data)
 
-    def _judge(self, folds: list[tuple[float, dict[float, float]]]) -> None:
-        for damping in DAMPINGS:
-            value = sum(weight * values[damping] for weight, values in folds)
-            past = self.values.get(damping, value)
-            self.values[damping] = MEMORY * past + (1.0 - MEMORY) * value
-        self.fisher_damping = max(self.values, key=self.values.__getitem__)
+    def _judge(self, folds: CrossFit) -> None:
+        """Update the exponentially weighted means with this rollout's values."""
+        total = dict.fromkeys(DAMPINGS, 0.0)
+        for fold in folds:
+            for damping, value in self._fold_values(folds, fold).items():
+                total[damping] += fold.weight * value
+        remember(self.values, total)
 
     def _fold_values(self, folds: CrossFit, fold: Fold) -> dict[float, float]:
         assert self.target_kl is not None

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Mapping
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from gymnasium import Env
@@ -20,6 +20,8 @@ from sb3_crpn import CRPN
 from sb3_crpn.algorithm.update import UpdateData
 from sb3_crpn.curvature import CurvatureEstimate
 from sb3_crpn.episodes import EpisodeBatch, Replay, concatenate
+
+Choice = TypeVar("Choice", bound=Hashable)
 
 MAX_ORACLE_ENVS = 16
 # Previous rollouts in the H of `MemoryHessian`
@@ -125,9 +127,7 @@ class ConfirmedHessian(CRPN):
         for fold in folds:
             for choice, value in self._fold_values(folds, fold).items():
                 total[choice] = total.get(choice, 0.0) + fold.weight * value
-        for choice, value in total.items():
-            past = self.values.get(choice, value)
-            self.values[choice] = MEMORY * past + (1.0 - MEMORY) * value
+        remember(self.values, total)
 
     def _fold_values(self, folds: CrossFit, fold: Fold) -> dict[tuple[str, float], float]:
         assert self.target_kl is not None
@@ -140,6 +140,12 @@ class ConfirmedHessian(CRPN):
             y = step_of_kl(fold.gradient, omega * rest, fold.space, self.target_kl)
             values[source, omega] = step_value(fold.test_gradient, test, y)
         return values
+
+
+def remember(values: dict[Choice, float], present: Mapping[Choice, float]) -> None:
+    """Update the exponentially weighted means ``values``; a choice's first value is its mean."""
+    for choice, value in present.items():
+        values[choice] = MEMORY * values.get(choice, value) + (1.0 - MEMORY) * value
 
 
 def step_value(gradient: Tensor, hessian: Tensor, y: Tensor) -> float:

@@ -7,7 +7,7 @@ from torch.autograd.functional import jacobian
 
 from benchmarks.exact import expected_causal_hessian, random_mdp
 from benchmarks.experiments import gradient_critic
-from benchmarks.experiments.cross_time import Chain, Critic, Steps, hessians
+from benchmarks.experiments.cross_time import Chain, Critic, Steps, hessians, next_values
 from sb3_crpn.curvature import Causal
 from sb3_crpn.curvature.derivatives import EpisodeDerivatives
 from sb3_crpn.episodes.batch import episode_starts
@@ -102,7 +102,7 @@ def test_lstd_leaves_no_error_on_its_own_steps(chain, batch):
     steps = Steps.of(chain, batch)
     critic = steps.fit(kappa, n_states)
     features = np.eye(n_states)[steps.states]
-    following = kappa * steps._following(critic.values[steps.states])
+    following = kappa * next_values(critic.values[steps.states], steps.lengths)
     errors = steps.rewards + following - critic.values[steps.states]
     np.testing.assert_allclose(features.T @ errors, 0.0, atol=1e-8)
     advantages = following - critic.baseline[steps.states]
