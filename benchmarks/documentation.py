@@ -96,7 +96,7 @@ def published() -> str:
 
 def headline() -> str:
     """Mean returns over training at equal settings; while none are measured, of the entries."""
-    found = equal.load((store.RESULTS, equal.RESULTS))
+    found = equal.load()
     body = []
     for task in found.tasks:
         n_seeds = len(found.values(TRPO_EQUAL, task, "mean_return"))

@@ -6,7 +6,8 @@
 
 Everything that the algorithms have in common is one and the same for an environment: environments,
 steps of an update, γ, λ, network, first action noise, normalisation, KL target and critic work. A
-run that the benchmark's results or this command's hold already is not repeated.
+run that the results of this command or of ``benchmarks.learning.rollouts`` hold already is not
+repeated. Those of ``benchmarks.learning`` do not count: some are of earlier code.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import pandas as pd
 
 from benchmarks.common.markdown import markdown
 from benchmarks.common.pool import run_all
-from benchmarks.learning import store
+from benchmarks.learning import rollouts, store
 from benchmarks.learning.comparison import Comparison, compare
 from benchmarks.learning.run import Run, execute, make_run
 from benchmarks.learning.settings import BUDGETS, RANDOM, TRPO_EQUAL
@@ -32,6 +33,7 @@ from benchmarks.learning.statistics import interquartile_mean, mean_score
 from benchmarks.learning.tables import aggregate_table, task_table
 
 RESULTS = Path(__file__).parent / "equal"
+FOLDERS = (rollouts.RESULTS, RESULTS)
 
 # Algorithm and overrides of its entry; ACRPN's entries are CRPN's
 ARMS: tuple[tuple[str, dict[str, Any]], ...] = (
@@ -82,11 +84,12 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the CSVs")
     parser.add_argument("--write", type=Path, metavar="FILE", help="run nothing, write the report")
     args = parser.parse_args()
+    folders = (rollouts.RESULTS, args.results)
     if args.write is not None:
         args.write.parent.mkdir(parents=True, exist_ok=True)
-        args.write.write_text(report(load((store.RESULTS, args.results), args.timesteps)))
+        args.write.write_text(report(load(folders, args.timesteps)))
         return
-    done = [store.read_runs(folder) for folder in (store.RESULTS, args.results)]
+    done = [store.read_runs(folder) for folder in folders]
     wanted = list(wanted_runs(args.envs, args.timesteps))
     missing = [run for run in wanted if not any(store.matches(run, rows).any() for rows in done)]
     print(f"{len(wanted) - len(missing)} of {len(wanted)} runs are done: {args.results}")
@@ -114,8 +117,22 @@ def _arms(env: str, seed: int, timesteps: int | None) -> list[Run]:
     return [make_run(algo, env, seed, given, timesteps=timesteps) for algo, given in ARMS]
 
 
-def load(folders: Sequence[Path], timesteps: int | None = None) -> Comparison:
-    """Return the runs of these arms, for the seeds that all arms have, and the random policy's."""
+def load(
+    folders: Sequence[Path] = FOLDERS,
+    timesteps: int | None = None,
+    random: Path = store.RESULTS,
+) -> Comparison:
+    """Return the runs of these arms, for the seeds that all arms have, and the random policy's.
+
+    Parameters
+    ----------
+    folders
+        Results with the arms' runs; of a run in several folders the last counts.
+    timesteps
+        Of a run; by default the benchmark's budget.
+    random
+        Results with the random policy's runs.
+    """
     runs = _joined([store.read_runs(folder) for folder in folders])
     curves = _joined([store.read_curves(folder) for folder in folders])
     found = []
@@ -124,8 +141,9 @@ def load(folders: Sequence[Path], timesteps: int | None = None) -> Comparison:
         if all(is_run.any() for _, is_run in arms):
             found += [runs[is_run].tail(1).assign(setting=run.setting) for run, is_run in arms]
     envs = {rows.env.iloc[0] for rows in found}
-    random = runs[(runs.algo == RANDOM) & runs.env.isin(envs)]
-    return compare(pd.concat([*found, random], ignore_index=True), curves, TRPO_EQUAL)
+    zeros = store.read_runs(random)
+    zeros = zeros[(zeros.algo == RANDOM) & zeros.env.isin(envs)]
+    return compare(pd.concat([*found, zeros], ignore_index=True), curves, TRPO_EQUAL)
 
 
 def _joined(frames: Sequence[pd.DataFrame]) -> pd.DataFrame:

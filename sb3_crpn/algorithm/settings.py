@@ -136,7 +136,7 @@ class PolicyNewtonSettings:
         "length of the last update's (at least one per environment). Before the first update one "
         "episode of each environment tells the length, and is not learnt from if more are to be "
         "run.",
-        1024,
+        512,
     )
     _: KW_ONLY
     rollout: str | Callable[[], Tracker] = setting(

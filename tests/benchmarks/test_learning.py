@@ -166,7 +166,7 @@ def test_the_report_at_equal_settings_has_the_seeds_that_all_arms_have(tmp_path:
     for seed in range(4):
         random = make_run("Random", "CartPole-v1", seed, {}, timesteps=1000)
         store.append(peers, random, _result(0.0, np.array([])))
-    found = equal.load((peers, folder), 1000)
+    found = equal.load((peers, folder), 1000, random=peers)
     assert found.complete_learners == found.learners
     task = "CartPole-v1 (1,000 steps)"
     arms = ["CRPN", "CRPN (hessian_shrinkage=0.0)", "ACRPN", TRPO_EQUAL]
