@@ -67,8 +67,6 @@ TASKS = {
     "CartPole-v1": Task(20_000, hessians=HESSIANS),
     "Pendulum-v1": Task(30_000, hessians=HESSIANS),
     "Acrobot-v1": Task(30_000),
-    "MountainCar-v0": Task(60_000, hessians=("none", "own", "confirmed")),
-    "LunarLander-v3": Task(60_000, hessians=("none", "own", "confirmed")),
 }
 
 
