@@ -33,7 +33,7 @@ from benchmarks.common.markdown import estimate, markdown
 from benchmarks.common.pool import run_all
 from benchmarks.common.table import Table
 from benchmarks.learning.run import Run, make_run, set_up, versions
-from benchmarks.learning.settings import changes_for, resolve
+from benchmarks.learning.settings import changes_for, resolve, update_timesteps
 
 RESULTS = Path(__file__).with_suffix(".csv")
 KEYS = ("env", "arm", "n_envs", "seed")
@@ -87,7 +87,7 @@ def make_job(arm: str, env: str, n_envs: int | None, seed: int) -> Job:
     published = entry.get("n_envs", 1)
     overrides: dict[str, Any] = {}
     if n_envs is not None and n_envs != published:
-        n_steps = max(1, entry["n_steps"] * published // n_envs)
+        n_steps = max(1, update_timesteps(arm, entry) // n_envs)
         overrides = {"n_envs": n_envs, "n_steps": n_steps}
         if arm == OURS:
             overrides = changes_for(env, n_envs) or overrides

@@ -26,7 +26,13 @@ from benchmarks.common.markdown import estimate, markdown
 from benchmarks.common.pool import run_all
 from benchmarks.learning import store
 from benchmarks.learning.run import Run, execute, make_run
-from benchmarks.learning.settings import BUDGETS, parse_setting, resolve, setting_label
+from benchmarks.learning.settings import (
+    BUDGETS,
+    parse_setting,
+    resolve,
+    setting_label,
+    update_timesteps,
+)
 
 RESULTS = Path(__file__).parent / "rollout"
 ROLLOUTS = ("episodes", "timesteps")
@@ -94,9 +100,8 @@ def _runs(stage: Stage) -> Iterator[Run]:
 
 def _size(env: str, n_envs: int) -> dict[str, int]:
     """Return the number of environments, and ``n_steps`` that keep the entry's update."""
-    entry = resolve("CRPN", env, {})[1]
-    steps = entry["n_steps"] * entry.get("n_envs", 1)
-    return {"n_envs": n_envs, "n_steps": max(1, round(steps / n_envs))}
+    timesteps = update_timesteps("CRPN", resolve("CRPN", env, {})[1])
+    return {"n_envs": n_envs, "n_steps": max(1, round(timesteps / n_envs))}
 
 
 def table(runs: pd.DataFrame) -> str:

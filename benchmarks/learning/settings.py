@@ -157,6 +157,12 @@ def resolve(
     return name, {**entry, **overrides}
 
 
+def update_timesteps(algo: str, entry: Mapping[str, Any]) -> int:
+    """Return an update's ``n_steps`` times the number of environments."""
+    n_steps = entry.get("n_steps", _signature(ALGORITHMS[algo].zoo_name)["n_steps"])
+    return int(n_steps * entry.get("n_envs", 1))
+
+
 def changes_for(env_id: str, n_envs: int) -> dict[str, Any]:
     """Return what CRPN's entry for so many environments changes in its usual one; {} without."""
     try:
